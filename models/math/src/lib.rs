@@ -1,6 +1,7 @@
 //! Numbers, vectors, matrices and their factorizations: knows no mechanics.
 
 pub mod dense_inverse;
+pub mod eights;
 pub mod elimination;
 pub mod gemm;
 pub mod hash;

@@ -15,6 +15,7 @@
 
 use plantd_math::rotation;
 use plantd_math::rotation::{Quaternion, Turn};
+use plantd_math::eights::Eight;
 use plantd_math::simd::widest;
 use plantd_math::spatial::{Mat3, Vec3, three};
 
@@ -22,7 +23,7 @@ use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::{Tangents, Workspace};
 use crate::lagrangian::armature;
-use crate::lagrangian::generators::{Flanks, Generators, MatrixKind, Step, Vertical, dot, of_ball};
+use crate::lagrangian::generators::{Flanks, Generators, MatrixKind, Step, Vertical, of_ball};
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::turning::{Turning, Weights};
 use crate::model::mechanism::Model;
@@ -44,6 +45,8 @@ pub(crate) struct BallJoints {
     pub(crate) vertical: Vertical,
     /// Of the joints at the midpoint.
     generators: Vec<Generators>,
+    /// What the axes of each ball joint have among themselves.
+    within: Vec<[[f64; 3]; 3]>,
 }
 
 impl BallJoints {
@@ -61,6 +64,7 @@ impl BallJoints {
             places,
             vertical: Vertical::new(model),
             generators: vec![Generators::default(); if no > 0 { joints } else { 0 }],
+            within: vec![[[0.0; 3]; 3]; no],
         }
     }
 
@@ -199,8 +203,10 @@ impl Workspace {
                 match joint.kind {
                     JointKind::Ball(0) if joint.coordinate < nd => {
                         let parts = step.parts_of_ball(&mid.mechanics, i);
-                        let own = of_ball(&parts, &weights[joint.orientation]);
+                        let o = joint.orientation;
+                        let (own, among) = of_ball(&parts, &weights[o]);
                         generators[i..i + 3].copy_from_slice(&own);
+                        balls.within[o] = among;
                     }
                     JointKind::Ball(_) => {}
                     _ => generators[i] = step.parts(&mid.mechanics, i).generators(),
@@ -208,22 +214,21 @@ impl Workspace {
             }
             for pair in &model.pairs {
                 let (i, j) = (pair.ancestor as usize, pair.descendant as usize);
-                matrix.upper[pair.slot as usize] = dot(&generators[i].minus, &generators[j].upper);
-                matrix.lower[pair.slot as usize] = dot(&generators[i].plus, &generators[j].lower);
+                matrix.upper[pair.slot as usize] = generators[i].minus.dot(generators[j].upper);
+                matrix.lower[pair.slot as usize] = generators[i].plus.dot(generators[j].lower);
             }
-            for (first, joint) in model.dynamics.joints.iter().enumerate() {
+            for joint in &model.dynamics.joints {
                 if joint.kind != JointKind::Ball(0) || joint.coordinate >= nd {
                     continue;
                 }
-                let weights = &weights[joint.orientation];
-                let own = step.within_ball(&mid.mechanics, model.gravity, first, weights);
+                let own = &balls.within[joint.orientation];
                 for row in 0..3 {
                     // The axes of a joint come last among those that its rows are coupled with.
                     let end = model.elimination.offsets[joint.coordinate + row + 1];
                     for column in 0..=row {
                         let slot = end - 1 - row + column;
-                        matrix.upper[slot] = own.0[row][column];
-                        matrix.lower[slot] = own.0[column][row];
+                        matrix.upper[slot] = own[column][row];
+                        matrix.lower[slot] = own[row][column];
                     }
                 }
             }

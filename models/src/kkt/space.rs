@@ -8,42 +8,37 @@
 //!
 //! with the vectors of [`generators`](crate::lagrangian::generators). Eliminating a leaf changes the matrix of
 //! the others by a product of the same form: what is eliminated below a joint is summed in an 8 by 8 matrix
-//! `A`,
+//! `A`. Up to three axes that are one below the other, such as those of a ball joint, are eliminated at once:
 //!
 //! ```text
-//! D_j = K_jj + minus_jᵀ A_j plus_j      U_j = upper_j + A_j plus_j      W_j = lower_j + A_jᵀ minus_j
-//! A_parent += A_j − U_j D_j⁻¹ W_jᵀ
+//! D_ab = K_ab + minus_aᵀ A plus_b      U_b = upper_b + A plus_b      W_a = lower_a + Aᵀ minus_a
+//! A_parent += A − U D⁻¹ Wᵀ
 //! ```
 //!
-//! as in [`planar`](crate::kkt::planar), and `D_j` are the pivots of an elimination from the leaves to the root.
-//! A ball joint has three of each, and `D_j` is a 3 by 3 matrix. As all sums are about one origin,
-//! the solution loses digits in long chains (up to 1e-11 of it in one of 64 hinges), which the next correction
-//! makes good.
+//! as in [`planar`](crate::kkt::planar), from the leaves to the root; the pivots are those of an elimination axis
+//! by axis. Each step up the tree waits for the one before, so it counts how many there are. As all sums are about
+//! one origin, the solution loses digits in long chains (up to 1e-11 of it in one of 64 hinges), which the next
+//! correction makes good.
 
 #[cfg(test)]
 mod tests;
 
+use std::hint::black_box;
+use std::ops::Range;
+
+use plantd_math::eights::{Eight, InEights, in_eights};
 use plantd_math::rows::Block;
-use plantd_math::simd::{wide, widest};
-use plantd_math::spatial::{Mat3, Vec3};
+use plantd_math::simd::wide;
 use plantd_math::tree_lu::SmallestPivot;
 
-use crate::lagrangian::generators::{
-    Generators, MatrixKind, Step, Vertical, dot, of_ball, rows as times,
-};
+use crate::lagrangian::generators::{Generators, MatrixKind, Parts, Step, Vertical, of_ball};
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::turning::Weights;
 use crate::model::mechanism::Model;
 use crate::model::tree::{JointKind, Tree};
 
-/// What is left of a joint when it has been eliminated.
-#[derive(Clone, Copy, Debug, Default)]
-struct Eliminated {
-    minus: Block,
-    plus: Block,
-    u: Block,
-    w_over_d: Block,
-}
+/// Axes that are eliminated at once, at most.
+const WIDEST: usize = 3;
 
 /// What is added to the second derivatives of the Lagrangian.
 #[derive(Clone, Copy, Debug)]
@@ -53,148 +48,239 @@ pub(crate) struct Added<'a> {
     pub(crate) balls: &'a [Weights],
 }
 
+/// What is left of an axis when it has been eliminated; before that, `upper` and `lower` stand in the last two.
+#[derive(Clone, Copy, Debug, Default)]
+struct Axis {
+    minus: Block,
+    plus: Block,
+    u: Block,
+    /// `D⁻¹ W`.
+    w_over_d: Block,
+}
+
+/// Axes one below the other that are eliminated at once: hinges, slides and screws, or those of a ball joint.
+#[derive(Clone, Debug)]
+struct Group {
+    axes: Range<usize>,
+    /// The orientation of a ball joint.
+    ball: Option<usize>,
+    is_root: bool,
+}
+
+/// Groups one below the other, with nothing beside them.
+#[derive(Clone, Debug)]
+struct Limb {
+    /// The lowest first.
+    groups: Range<usize>,
+    /// Where the sums of the limbs are that hang from its lowest joint.
+    carries: Option<usize>,
+    hangs_from: Option<Fork>,
+}
+
+/// Where limbs meet.
+#[derive(Clone, Copy, Debug)]
+struct Fork {
+    place: usize,
+    /// It is the first of the limbs to be eliminated.
+    is_first: bool,
+}
+
 /// The Newton matrix of a tree in space, factored.
 #[derive(Clone, Debug)]
 pub(crate) struct SpatialRecursion {
-    eliminated: Vec<Eliminated>,
-    inverse_d: Vec<f64>,
-    /// `D⁻¹` of ball joints, by their orientations.
-    inverse_blocks: Vec<Mat3>,
-    /// Where the sums of each joint are.
-    places: Vec<usize>,
-    /// Whether a joint carries others: below one that carries none `A` is zero.
-    carries: Vec<bool>,
-    /// `A` by rows; zero but for joints whose elimination has begun.
-    sums: Vec<[Block; 8]>,
+    vertical: Vertical,
+    /// In the order of their elimination, as are groups.
+    limbs: Vec<Limb>,
+    groups: Vec<Group>,
+    parts: Vec<Parts>,
+    axes: Vec<Axis>,
+    /// `K` of each group by itself; once it is eliminated, `D⁻¹`.
+    within: Vec<[[f64; WIDEST]; WIDEST]>,
+    /// `A` and its transpose, by rows, where limbs meet. As trees are walked depth first, there are few, which
+    /// stay in the nearest cache.
+    sums: Vec<[[Block; 8]; 2]>,
     /// Flows of right-hand sides, and twists that belong to solutions.
     flows: Vec<Block>,
-    vertical: Vertical,
 }
 
-/// Places of sums: an only child takes that of its parent, others the next one. As trees are walked depth
-/// first, there are few, which stay in the nearest cache.
-fn places(tree: &Tree) -> Vec<usize> {
-    let mut children = vec![0; tree.joints.len()];
-    for joint in &tree.joints {
+/// `A` in registers.
+#[derive(Clone, Copy)]
+struct Sums<E> {
+    rows: [E; 8],
+    columns: [E; 8],
+}
+
+impl<E: Eight> Sums<E> {
+    #[inline(always)]
+    fn zero() -> Self {
+        Self { rows: [E::all(0.0); 8], columns: [E::all(0.0); 8] }
+    }
+
+    #[inline(always)]
+    fn of([rows, columns]: &[[Block; 8]; 2]) -> Self {
+        let mut sums = Self::zero();
+        for k in 0..8 {
+            sums.rows[k] = E::of(&rows[k]);
+            sums.columns[k] = E::of(&columns[k]);
+        }
+        sums
+    }
+
+    #[inline(always)]
+    fn plus(mut self, o: &Self) -> Self {
+        for k in 0..8 {
+            self.rows[k] = self.rows[k].plus(o.rows[k]);
+            self.columns[k] = self.columns[k].plus(o.columns[k]);
+        }
+        self
+    }
+
+    #[inline(always)]
+    fn put(&self, [rows, columns]: &mut [[Block; 8]; 2]) {
+        for k in 0..8 {
+            self.rows[k].put(&mut rows[k]);
+            self.columns[k].put(&mut columns[k]);
+        }
+    }
+}
+
+/// The sum of eight lines, each times an entry of `v`.
+#[inline(always)]
+fn combined<E: Eight>(lines: &[E; 8], v: &Block) -> E {
+    let mut sums = [E::all(0.0); 4];
+    for (k, sum) in sums.iter_mut().enumerate() {
+        *sum = lines[k].scaled(v.0[k]).plus(lines[k + 4].scaled(v.0[k + 4]));
+    }
+    sums[0].plus(sums[2]).plus(sums[1].plus(sums[3]))
+}
+
+/// The inverse of a matrix by rows, and the pivots of its elimination from the last row to the first.
+#[inline(always)]
+fn inverse<const W: usize>(d: &[[f64; W]; W]) -> ([[f64; W]; W], [f64; W]) {
+    let (mut inverse, mut pivots) = ([[0.0; W]; W], [0.0; W]);
+    match W {
+        1 => {
+            pivots[0] = d[0][0];
+            inverse[0][0] = 1.0 / d[0][0];
+        }
+        2 => {
+            let determinant = d[0][0] * d[1][1] - d[0][1] * d[1][0];
+            let scale = 1.0 / determinant;
+            inverse[0][0] = d[1][1] * scale;
+            inverse[0][1] = -d[0][1] * scale;
+            inverse[1][0] = -d[1][0] * scale;
+            inverse[1][1] = d[0][0] * scale;
+            pivots[0] = determinant / d[1][1];
+            pivots[1] = d[1][1];
+        }
+        _ => {
+            // The minor of entry `(a, b)`, with its sign.
+            let minor = |a: usize, b: usize| {
+                let [i, j] = [(a + 1) % 3, (a + 2) % 3];
+                let [k, l] = [(b + 1) % 3, (b + 2) % 3];
+                d[i][k] * d[j][l] - d[i][l] * d[j][k]
+            };
+            let first = minor(0, 0);
+            let determinant = d[0][0] * first + d[0][1] * minor(0, 1) + d[0][2] * minor(0, 2);
+            let scale = 1.0 / determinant;
+            for (a, row) in inverse.iter_mut().enumerate() {
+                for (b, entry) in row.iter_mut().enumerate() {
+                    *entry = minor(b, a) * scale;
+                }
+            }
+            pivots[0] = determinant / first;
+            pivots[1] = first / d[2][2];
+            pivots[2] = d[2][2];
+        }
+    }
+    (inverse, pivots)
+}
+
+/// Limbs and groups in the order of their elimination, and how many places of sums there are.
+fn limbs(tree: &Tree) -> (Vec<Limb>, Vec<Group>, usize) {
+    let joints = &tree.joints[..];
+    let mut children = vec![0; joints.len()];
+    // Forks on the way to each joint, which are the places of its own one: what is below a joint is done
+    // with before the next one needs the place.
+    let mut forks = vec![0; joints.len()];
+    for joint in joints {
         if let Some(count) = children.get_mut(joint.parent) {
             *count += 1;
         }
     }
-    let mut places = Vec::with_capacity(children.len());
-    for joint in &tree.joints {
-        places.push(match children.get(joint.parent) {
-            Some(1) => places[joint.parent],
-            Some(_) => places[joint.parent] + 1,
-            None => 0,
+    for (i, joint) in joints.iter().enumerate() {
+        if let Some(&count) = children.get(joint.parent) {
+            forks[i] = forks[joint.parent] + usize::from(count > 1);
+        }
+    }
+    let (mut limbs, mut groups, mut seen) = (Vec::new(), Vec::new(), vec![false; joints.len()]);
+    let mut end = joints.len();
+    while end > 0 {
+        let lowest = end - 1;
+        let mut top = lowest;
+        while joints[top].parent.checked_add(1) == Some(top) && children[top - 1] == 1 {
+            top -= 1;
+        }
+        let parent = joints[top].parent;
+        let begin = groups.len();
+        gather(tree, top..end, &mut groups);
+        if let (Some(last), None) = (groups.last_mut(), children.get(parent)) {
+            last.is_root = true;
+        }
+        limbs.push(Limb {
+            groups: begin..groups.len(),
+            carries: (children[lowest] > 1).then_some(forks[lowest]),
+            hangs_from: seen.get_mut(parent).map(|seen| Fork {
+                place: forks[parent],
+                is_first: !std::mem::replace(seen, true),
+            }),
         });
+        end = top;
     }
-    places
+    (limbs, groups, forks.iter().max().map_or(0, |most| most + 1))
 }
 
-/// `A v`.
-#[inline(always)]
-fn product(a: &[Block; 8], v: &Block) -> Block {
-    let mut out = Block::ZERO;
-    for (out, line) in out.0.iter_mut().zip(a) {
-        *out = dot(line, v);
-    }
-    out
-}
-
-/// `A` times three vectors, as [`product`] finds them one by one: with its columns side by side once.
-#[inline(always)]
-fn products(a: &[Block; 8], vectors: [&Block; 3]) -> [Block; 3] {
-    let mut columns = [Block::ZERO; 8];
-    for (i, line) in a.iter().enumerate() {
-        for (column, entry) in columns.iter_mut().zip(line.0) {
-            column.0[i] = entry;
+/// Groups of axes one below the other, the lowest first; as few as can be, and of like sizes.
+fn gather(tree: &Tree, axes: Range<usize>, groups: &mut Vec<Group>) {
+    let is_root = false;
+    let mut end = axes.end;
+    while end > axes.start {
+        if let JointKind::Ball(axis) = tree.joints[end - 1].kind {
+            let start = end - 1 - axis;
+            let ball = Some(tree.joints[start].orientation);
+            groups.push(Group { axes: start..end, ball, is_root });
+            end = start;
+            continue;
+        }
+        let is_ball = |i: &usize| matches!(tree.joints[*i].kind, JointKind::Ball(_));
+        let start = (axes.start..end).rev().find(is_ball).map_or(axes.start, |i| i + 1);
+        for left in (1..=(end - start).div_ceil(WIDEST)).rev() {
+            let width = (end - start).div_ceil(left);
+            groups.push(Group { axes: end - width..end, ball: None, is_root });
+            end -= width;
         }
     }
-    vectors.map(|v| {
-        let pair = |k: usize| columns[k].times(v.0[k]).plus(columns[k + 4].times(v.0[k + 4]));
-        (pair(0).plus(pair(1))).plus(pair(2).plus(pair(3)))
-    })
-}
-
-/// `start + Aᵀ v`.
-#[inline(always)]
-fn transposed(start: Block, a: &[Block; 8], v: &Block) -> Block {
-    let mut out = start;
-    for (two, lines) in v.0.as_chunks::<2>().0.iter().zip(a.as_chunks::<2>().0) {
-        out = out.plus(lines[0].times(two[0]).plus(lines[1].times(two[1])));
-    }
-    out
-}
-
-/// Passes what is eliminated at a place on to that of the parent.
-#[inline(always)]
-fn pass(sums: &mut [Block; 8], above: &mut [[Block; 8]], place: usize, parent: Option<&usize>) {
-    match parent {
-        Some(&to) if to == place => {}
-        to => {
-            if let Some(&to) = to {
-                for (target, line) in above[to].iter_mut().zip(&*sums) {
-                    *target = target.plus(*line);
-                }
-            }
-            *sums = [Block::ZERO; 8];
-        }
-    }
-}
-
-/// The inverse of a 3 by 3 matrix, with the pivots of its elimination from the last row to the first.
-#[inline(always)]
-fn inverse(d: &Mat3) -> (Mat3, Vec3) {
-    let Mat3([x, y, z]) = *d;
-    let [last, middle] = [x.cross(y), x.cross(z)];
-    let minor = y[1] * z[2] - z[1] * y[2];
-    let determinant = z.dot(last);
-    let scale = 1.0 / determinant;
-    let rows = [y.cross(z) * scale, middle * -scale, last * scale];
-    (Mat3(rows).transpose(), Vec3([determinant / minor, minor / z[2], z[2]]))
-}
-
-/// What the axes of a ball joint give to the matrix. Apart from their elimination, with which compilers would
-/// mix it number by number.
-#[inline(never)]
-fn write_generators(
-    step: &Step,
-    mechanics: &Mechanics,
-    first: usize,
-    weights: &Weights,
-    out: &mut [Generators; 3],
-) {
-    wide!({
-        *out = of_ball(&step.parts_of_ball(mechanics, first), weights);
-    });
 }
 
 impl SpatialRecursion {
     pub(crate) fn new(model: &Model) -> Self {
         let joints = model.dynamics.joints.len();
-        let places = places(&model.dynamics);
-        let most = places.iter().max().map_or(0, |most| most + 1);
-        let mut carries = vec![false; joints];
-        for joint in &model.dynamics.joints {
-            if let Some(parent) = carries.get_mut(joint.parent) {
-                *parent = true;
-            }
-        }
+        let (limbs, groups, places) = limbs(&model.dynamics);
         Self {
-            carries,
-            eliminated: vec![Eliminated::default(); joints],
-            inverse_d: vec![0.0; joints],
-            inverse_blocks: vec![Mat3::ZERO; model.orientations.len()],
-            places,
-            sums: vec![[Block::ZERO; 8]; most],
-            flows: vec![Block::ZERO; most],
             vertical: Vertical::new(model),
+            within: vec![[[0.0; WIDEST]; WIDEST]; groups.len()],
+            limbs,
+            groups,
+            parts: vec![Parts::default(); joints],
+            axes: vec![Axis::default(); joints],
+            sums: vec![[[Block::ZERO; 8]; 2]; places],
+            flows: vec![Block::ZERO; places],
         }
     }
 
     /// Factors the matrix that belongs to the second derivatives of `mechanics`; all joints are dynamic,
     /// in the order of their coordinates. Each pivot is compared with the larger of its diagonal entry
-    /// and the inertia of its row over the step. Of masses alone it is `−M/h`. About 450 flops an axis.
+    /// and the inertia of its row over the step. Of masses alone it is `−M/h`. About 600 flops an axis.
     #[inline(never)]
     pub(crate) fn factor(
         &mut self,
@@ -204,175 +290,279 @@ impl SpatialRecursion {
         step: f64,
         kind: MatrixKind,
     ) -> SmallestPivot {
-        widest!({
-            let step = Step::new(&self.vertical, step, kind);
-            if added.balls.is_empty() {
-                self.eliminate::<false>(model, mechanics, added, &step)
-            } else {
-                self.eliminate::<true>(model, mechanics, added, &step)
+        let step = Step::new(&self.vertical, step, kind);
+        self.write_parts(mechanics, &step);
+        in_eights(Factor { recursion: self, added, inertia: &model.conditioning.inertia, step })
+    }
+
+    /// From the last, with which the elimination begins, to the first.
+    #[inline(never)]
+    fn write_parts(&mut self, mechanics: &Mechanics, step: &Step) {
+        wide!({
+            for (joint, parts) in self.parts.iter_mut().enumerate() {
+                *parts = step.parts(mechanics, joint);
             }
         })
-    }
-
-    /// From the leaves to the root; `BALLS`: some joint is a ball joint.
-    #[inline(always)]
-    fn eliminate<const BALLS: bool>(
-        &mut self,
-        model: &Model,
-        mechanics: &Mechanics,
-        added: Added<'_>,
-        step: &Step,
-    ) -> SmallestPivot {
-        let mut smallest = SmallestPivot::NONE;
-        for (row, joint) in model.dynamics.joints.iter().enumerate().rev() {
-            if let (true, JointKind::Ball(axis)) = (BALLS, joint.kind) {
-                if axis == 0 {
-                    self.eliminate_ball(model, mechanics, added, step, row, &mut smallest);
-                }
-                continue;
-            }
-            let generators = step.parts(mechanics, row).generators();
-            let Generators { minus, plus, upper, lower } = generators;
-            let place = self.places[row];
-            let (sums, own) = self.sums.split_at_mut(place);
-            let own = &mut own[0];
-            // U = upper + A plus,  W = lower + Aᵀ minus,  D = K_jj + minusᵀ A plus.
-            let [mut a_plus, mut w] = [Block::ZERO, lower];
-            if self.carries[row] {
-                a_plus = product(own, &plus);
-                w = transposed(lower, own, &minus);
-            }
-            let u = upper.plus(a_plus);
-            let k_jj = dot(&minus, &upper) + added.diagonal[row];
-            let d = k_jj + dot(&minus, &a_plus);
-            let inertia = model.conditioning.inertia[row] * step.inverse.abs();
-            smallest.see(row, d, k_jj.abs().max(inertia));
-            let inverse_d = 1.0 / d;
-            let w_over_d = w.times(inverse_d);
-            // A −= U Wᵀ / D, and on to the parent.
-            for (line, u) in own.iter_mut().zip(u.0) {
-                *line = line.plus(w_over_d.times(-u));
-            }
-            pass(own, sums, place, self.places.get(joint.parent));
-            self.eliminated[row] = Eliminated { minus, plus, u, w_over_d };
-            self.inverse_d[row] = inverse_d;
-        }
-        smallest
-    }
-
-    /// The same for the three axes of a ball joint.
-    #[inline(always)]
-    fn eliminate_ball(
-        &mut self,
-        model: &Model,
-        mechanics: &Mechanics,
-        added: Added<'_>,
-        step: &Step,
-        first: usize,
-        smallest: &mut SmallestPivot,
-    ) {
-        let joint = &model.dynamics.joints[first];
-        let weights = &added.balls[joint.orientation];
-        let generators = &mut [Generators::default(); 3];
-        write_generators(step, mechanics, first, weights, generators);
-        let place = self.places[first];
-        let (sums, own) = self.sums.split_at_mut(place);
-        let own = &mut own[0];
-        let [p, q, r] = &*generators;
-        let [mut a_plus, mut w] = [[Block::ZERO; 3], [p.lower, q.lower, r.lower]];
-        let k = step.within_ball(mechanics, model.gravity, first, weights);
-        let mut d = k;
-        if self.carries[first + 2] {
-            a_plus = products(own, [&p.plus, &q.plus, &r.plus]);
-            for (w, generators) in w.iter_mut().zip(&*generators) {
-                *w = transposed(*w, own, &generators.minus);
-            }
-            for (column, a_plus) in d.0.iter_mut().zip(&a_plus) {
-                for (entry, generators) in column.0.iter_mut().zip(&*generators) {
-                    *entry += dot(&generators.minus, a_plus);
-                }
-            }
-        }
-        let (inverse_d, pivots) = inverse(&d);
-        for a in (0..3).rev() {
-            let inertia = model.conditioning.inertia[first + a] * step.inverse.abs();
-            smallest.see(first + a, pivots[a], k.0[a][a].abs().max(inertia));
-        }
-        let w_over_d = times(&inverse_d, &w);
-        for a in 0..3 {
-            let Generators { minus, plus, upper, .. } = generators[a];
-            let u = upper.plus(a_plus[a]);
-            for (line, u) in own.iter_mut().zip(u.0) {
-                *line = line.plus(w_over_d[a].times(-u));
-            }
-            self.eliminated[first + a] = Eliminated { minus, plus, u, w_over_d: w_over_d[a] };
-        }
-        pass(own, sums, place, self.places.get(joint.parent));
-        self.inverse_blocks[joint.orientation] = inverse_d;
     }
 
     /// Solves `K x = b` in place, about 65 flops an axis.
     #[inline(never)]
-    pub(crate) fn solve(&mut self, tree: &Tree, x: &mut [f64]) {
-        widest!({
-            if self.inverse_blocks.is_empty() {
-                self.substitute::<false>(tree, x);
-            } else {
-                self.substitute::<true>(tree, x);
+    pub(crate) fn solve(&mut self, x: &mut [f64]) {
+        in_eights(Solve { recursion: self, x });
+    }
+}
+
+/// An elimination.
+struct Factor<'a> {
+    recursion: &'a mut SpatialRecursion,
+    added: Added<'a>,
+    inertia: &'a [f64],
+    step: Step,
+}
+
+impl InEights for Factor<'_> {
+    type Output = SmallestPivot;
+
+    #[inline(always)]
+    fn run<E: Eight>(self) -> SmallestPivot {
+        let Self { recursion, added, inertia, step } = self;
+        recursion.generate::<E>(added);
+        recursion.eliminate::<E>(|axis| inertia[axis] * step.inverse.abs())
+    }
+}
+
+impl SpatialRecursion {
+    /// Writes the vectors of all axes, and `K` of each group.
+    #[inline(always)]
+    fn generate<E: Eight>(&mut self, added: Added<'_>) {
+        for (group, within) in self.groups.iter().zip(&mut self.within) {
+            let range = group.axes.clone();
+            let (parts, axes) = (&self.parts[range.clone()], &mut self.axes[range.clone()]);
+            if let (Some(ball), [p, q, r]) = (group.ball, parts) {
+                let parts = [Parts::<E>::of(p), Parts::<E>::of(q), Parts::<E>::of(r)];
+                let (generators, own) = of_ball(&parts, &added.balls[ball]);
+                for (axis, own) in axes.iter_mut().zip(generators) {
+                    axis.set(own);
+                }
+                *within = own;
+                continue;
             }
-        })
+            for (axis, parts) in axes.iter_mut().zip(parts) {
+                axis.set(Parts::<E>::of(parts).generators());
+            }
+            let diagonal = &added.diagonal[range];
+            match *axes {
+                [ref a] => write_within::<E, 1>([a], diagonal, within),
+                [ref a, ref b] => write_within::<E, 2>([a, b], diagonal, within),
+                [ref a, ref b, ref c] => write_within::<E, 3>([a, b, c], diagonal, within),
+                _ => {}
+            }
+        }
     }
 
-    /// `BALLS`: some joint is a ball joint.
+    /// From the leaves to the root.
     #[inline(always)]
-    fn substitute<const BALLS: bool>(&mut self, tree: &Tree, x: &mut [f64]) {
-        let (eliminated, inverse_d) = (&self.eliminated[..], &self.inverse_d[..]);
-        let (places, flows) = (&self.places[..], &mut self.flows[..]);
-        flows.fill(Block::ZERO);
-        for (i, joint) in tree.joints.iter().enumerate().rev() {
-            let (own, place) = (&eliminated[i], places[i]);
-            let mut flow = flows[place];
-            match joint.kind {
-                JointKind::Ball(0) if BALLS => {
-                    let axes = &eliminated[i..i + 3];
-                    let b = |a: usize| x[i + a] - dot(&axes[a].minus, &flow);
-                    let b = Vec3([b(0), b(1), b(2)]);
-                    let value = self.inverse_blocks[joint.orientation].apply(b);
-                    for (own, value) in axes.iter().zip(value.0) {
-                        flow = flow.plus(own.u.times(value));
-                    }
-                    x[i..i + 3].copy_from_slice(&value.0);
+    fn eliminate<E: Eight>(&mut self, inertia: impl Fn(usize) -> f64) -> SmallestPivot {
+        let mut smallest = SmallestPivot::NONE;
+        for limb in &self.limbs {
+            let mut sums = match limb.carries {
+                Some(place) => Sums::<E>::of(&self.sums[place]),
+                None => Sums::zero(),
+            };
+            let mut carries = limb.carries.is_some();
+            for at in limb.groups.clone() {
+                let (group, within) = (&self.groups[at], &mut self.within[at]);
+                let first = group.axes.start;
+                let see = |axis: usize, pivot: f64, entry: f64| {
+                    smallest.see(first + axis, pivot, entry.abs().max(inertia(first + axis)));
+                };
+                let (is_root, sums) = (group.is_root, &mut sums);
+                match &mut self.axes[group.axes.clone()] {
+                    [a] => eliminate([a], within, sums, carries, is_root, see),
+                    [a, b] => eliminate([a, b], within, sums, carries, is_root, see),
+                    [a, b, c] => eliminate([a, b, c], within, sums, carries, is_root, see),
+                    _ => {}
                 }
-                JointKind::Ball(_) if BALLS => continue,
-                _ => {
-                    let value = (x[i] - dot(&own.minus, &flow)) * inverse_d[i];
-                    x[i] = value;
-                    flow = flow.plus(own.u.times(value));
-                }
+                carries = true;
             }
-            match places.get(joint.parent) {
-                Some(&to) if to == place => flows[to] = flow,
-                to => {
-                    flows[place] = Block::ZERO;
-                    if let Some(&to) = to {
-                        flows[to] = flows[to].plus(flow);
-                    }
-                }
+            if let Some(Fork { place, is_first }) = limb.hangs_from {
+                let all = &mut self.sums[place];
+                let sums = if is_first { sums } else { sums.plus(&Sums::of(all)) };
+                sums.put(all);
             }
         }
-        for (i, joint) in tree.joints.iter().enumerate() {
-            let axes = match joint.kind {
-                JointKind::Ball(0) if BALLS => i..i + 3,
-                JointKind::Ball(_) if BALLS => continue,
-                _ => i..i + 1,
-            };
-            let flow = places.get(joint.parent).map_or(Block::ZERO, |&place| flows[place]);
-            let mut moved = flow;
-            for (x, own) in x[axes.clone()].iter_mut().zip(&eliminated[axes]) {
-                *x -= dot(&own.w_over_d, &flow);
-                moved = moved.plus(own.plus.times(*x));
-            }
-            flows[places[i]] = moved;
+        smallest
+    }
+}
+
+impl Axis {
+    #[inline(always)]
+    fn set<E: Eight>(&mut self, generators: Generators<E>) {
+        let Generators { minus, plus, upper, lower } = generators;
+        minus.put(&mut self.minus);
+        plus.put(&mut self.plus);
+        upper.put(&mut self.u);
+        lower.put(&mut self.w_over_d);
+    }
+}
+
+/// `K` of hinges, slides and screws one below the other.
+#[inline(always)]
+fn write_within<E: Eight, const W: usize>(
+    axes: [&Axis; W],
+    diagonal: &[f64],
+    within: &mut [[f64; WIDEST]; WIDEST],
+) {
+    for (a, above) in axes.iter().enumerate() {
+        let (minus, plus) = (E::of(&above.minus), E::of(&above.plus));
+        within[a][a] = minus.dot(E::of(&above.u)) + diagonal[a];
+        for (b, below) in axes.iter().enumerate().skip(a + 1) {
+            within[a][b] = minus.dot(E::of(&below.u));
+            within[b][a] = plus.dot(E::of(&below.w_over_d));
         }
     }
+}
+
+/// Eliminates the axes of a group; `see` takes an axis, its pivot, and what stands in `K` in its place.
+#[inline(always)]
+fn eliminate<E: Eight, const W: usize>(
+    axes: [&mut Axis; W],
+    within: &mut [[f64; WIDEST]; WIDEST],
+    sums: &mut Sums<E>,
+    carries: bool,
+    is_root: bool,
+    mut see: impl FnMut(usize, f64, f64),
+) {
+    let mut d = [[0.0; W]; W];
+    let [mut u, mut w] = [[E::all(0.0); W]; 2];
+    for a in 0..W {
+        d[a].copy_from_slice(&within[a][..W]);
+        u[a] = E::of(&axes[a].u);
+        w[a] = E::of(&axes[a].w_over_d);
+    }
+    if carries {
+        for b in 0..W {
+            let product = combined(&sums.columns, &axes[b].plus);
+            u[b] = u[b].plus(product);
+            w[b] = w[b].plus(combined(&sums.rows, &axes[b].minus));
+            for (row, axis) in d.iter_mut().zip(&axes) {
+                row[b] += E::of(&axis.minus).dot(product);
+            }
+        }
+    }
+    let (inverse, pivots) = inverse(&d);
+    for a in (0..W).rev() {
+        see(a, pivots[a], within[a][a]);
+    }
+    let mut w_over_d = [E::all(0.0); W];
+    for a in 0..W {
+        w_over_d[a] = w[0].scaled(inverse[a][0]);
+        for b in 1..W {
+            w_over_d[a] = w_over_d[a].plus(w[b].scaled(inverse[a][b]));
+        }
+        u[a].put(&mut axes[a].u);
+        w_over_d[a].put(&mut axes[a].w_over_d);
+        within[a][..W].copy_from_slice(&inverse[a]);
+    }
+    if is_root {
+        return;
+    }
+    for a in 0..W {
+        // Number by number from memory, where compilers would take the registers apart.
+        let axis: &Axis = black_box(&*axes[a]);
+        for k in 0..8 {
+            sums.rows[k] = sums.rows[k].minus(w_over_d[a].scaled(axis.u.0[k]));
+            sums.columns[k] = sums.columns[k].minus(u[a].scaled(axis.w_over_d.0[k]));
+        }
+    }
+}
+
+/// A solution.
+struct Solve<'a> {
+    recursion: &'a mut SpatialRecursion,
+    x: &'a mut [f64],
+}
+
+impl InEights for Solve<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<E: Eight>(self) {
+        let Self { recursion, x } = self;
+        let SpatialRecursion { limbs, groups, axes, within, flows, .. } = recursion;
+        for limb in &*limbs {
+            let mut flow = match limb.carries {
+                Some(place) => E::of(&flows[place]),
+                None => E::all(0.0),
+            };
+            for at in limb.groups.clone() {
+                let range = groups[at].axes.clone();
+                let (axes, x, inverse) = (&axes[range.clone()], &mut x[range], &within[at]);
+                flow = match (axes, x) {
+                    ([a], [x]) => lift([a], [x], inverse, flow),
+                    ([a, b], [x, y]) => lift([a, b], [x, y], inverse, flow),
+                    ([a, b, c], [x, y, z]) => lift([a, b, c], [x, y, z], inverse, flow),
+                    _ => flow,
+                };
+            }
+            if let Some(Fork { place, is_first }) = limb.hangs_from {
+                let all = &mut flows[place];
+                let flow = if is_first { flow } else { flow.plus(E::of(all)) };
+                flow.put(all);
+            }
+        }
+        for limb in limbs.iter().rev() {
+            let mut flow = match limb.hangs_from {
+                Some(fork) => E::of(&flows[fork.place]),
+                None => E::all(0.0),
+            };
+            for at in limb.groups.clone().rev() {
+                let range = groups[at].axes.clone();
+                flow = match (&axes[range.clone()], &mut x[range]) {
+                    ([a], [x]) => lower([a], [x], flow),
+                    ([a, b], [x, y]) => lower([a, b], [x, y], flow),
+                    ([a, b, c], [x, y, z]) => lower([a, b, c], [x, y, z], flow),
+                    _ => flow,
+                };
+            }
+            if let Some(place) = limb.carries {
+                flow.put(&mut flows[place]);
+            }
+        }
+    }
+}
+
+/// Eliminates the right-hand sides of a group: the flow above it, from the one below.
+#[inline(always)]
+fn lift<E: Eight, const W: usize>(
+    axes: [&Axis; W],
+    x: [&mut f64; W],
+    inverse: &[[f64; WIDEST]; WIDEST],
+    flow: E,
+) -> E {
+    let mut b = [0.0; W];
+    for a in 0..W {
+        b[a] = *x[a] - E::of(&axes[a].minus).dot(flow);
+    }
+    let mut next = flow;
+    for a in 0..W {
+        let mut value = inverse[a][0] * b[0];
+        for c in 1..W {
+            value += inverse[a][c] * b[c];
+        }
+        *x[a] = value;
+        next = next.plus(E::of(&axes[a].u).scaled(value));
+    }
+    next
+}
+
+/// The solution of a group and the flow below it, from the one above.
+#[inline(always)]
+fn lower<E: Eight, const W: usize>(axes: [&Axis; W], x: [&mut f64; W], flow: E) -> E {
+    let mut next = flow;
+    for (x, axis) in x.into_iter().zip(axes) {
+        *x -= E::of(&axis.w_over_d).dot(flow);
+        next = next.plus(E::of(&axis.plus).scaled(*x));
+    }
+    next
 }

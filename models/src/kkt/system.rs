@@ -235,7 +235,7 @@ impl KktSystem {
                 }
             }
             (Recursion::Spatial(recursion), Factors::Recursion, _) => {
-                recursion.solve(&model.dynamics, x);
+                recursion.solve(x);
             }
             _ => {
                 self.factored.tree.solve(&model.elimination, x);

@@ -27,6 +27,7 @@
 //!
 //! ```text
 //! K = T⁻ (¼h τ_ζ C + ½ τ_v) − N⁻ (½ m_ζ C + m_v/h) + (T⁻)' (½h τ + a h f) − (N⁻)' m
+//! K_ab = lower_a · (Cᵀ rate)_b + (T⁻ rate)_a · force_b − (N⁻ force)_a · axis_b + ...
 //! ```
 //!
 //! with the derivatives of torque `τ` and momentum `m` by a turn `ζ` of the midpoint and the velocity `v`,
@@ -43,10 +44,10 @@
 //!
 //! with products that are, like those of `K`, those of the residual itself.
 
+use plantd_math::eights::Eight;
 use plantd_math::rows::Block;
 use plantd_math::spatial::{Mat3, Vec3};
 
-use crate::lagrangian::curvature::Within;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::turning::{Turning, Weights};
 use crate::model::mechanism::Model;
@@ -77,27 +78,20 @@ pub(crate) struct Step {
 
 /// What the generators of a joint are made of.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Parts {
-    pub(crate) axis: Block,
-    pub(crate) rate: Block,
-    pub(crate) force: Block,
-    pub(crate) slope: Block,
+pub(crate) struct Parts<E = Block> {
+    pub(crate) axis: E,
+    pub(crate) rate: E,
+    pub(crate) force: E,
+    pub(crate) slope: E,
 }
 
 /// What a joint gives to the matrix.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Generators {
-    pub(crate) minus: Block,
-    pub(crate) plus: Block,
-    pub(crate) upper: Block,
-    pub(crate) lower: Block,
-}
-
-#[inline(always)]
-pub(crate) fn dot(a: &Block, b: &Block) -> f64 {
-    let (a, b) = (&a.0, &b.0);
-    let pair = |k: usize| a[k] * b[k] + a[k + 4] * b[k + 4];
-    (pair(0) + pair(1)) + (pair(2) + pair(3))
+pub(crate) struct Generators<E = Block> {
+    pub(crate) minus: E,
+    pub(crate) plus: E,
+    pub(crate) upper: E,
+    pub(crate) lower: E,
 }
 
 #[inline(always)]
@@ -106,23 +100,29 @@ fn lanes(a: Vec3, b: Vec3, [c, d]: [f64; 2]) -> Block {
 }
 
 #[inline(always)]
-fn sum([a, b, c]: &[Block; 3], weights: Vec3) -> Block {
-    a.times(weights[0]).plus(b.times(weights[1])).plus(c.times(weights[2]))
+fn sum<E: Eight>([a, b, c]: &[E; 3], weights: [f64; 3]) -> E {
+    a.scaled(weights[0]).plus(b.scaled(weights[1])).plus(c.scaled(weights[2]))
 }
 
 /// `m` times three vectors, one below the other.
 #[inline(always)]
-pub(crate) fn rows(m: &Mat3, vectors: &[Block; 3]) -> [Block; 3] {
+fn rows<E: Eight>(m: &Mat3, vectors: &[E; 3]) -> [E; 3] {
     let Mat3([x, y, z]) = m;
-    let row = |a: usize| sum(vectors, Vec3([x[a], y[a], z[a]]));
-    [row(0), row(1), row(2)]
+    let mut out = *vectors;
+    for (a, out) in out.iter_mut().enumerate() {
+        *out = sum(vectors, [x[a], y[a], z[a]]);
+    }
+    out
 }
 
 /// `mᵀ` times three vectors, one below the other.
 #[inline(always)]
-pub(crate) fn columns(m: &Mat3, vectors: &[Block; 3]) -> [Block; 3] {
-    let Mat3([x, y, z]) = *m;
-    [sum(vectors, x), sum(vectors, y), sum(vectors, z)]
+pub(crate) fn columns<E: Eight>(m: &Mat3, vectors: &[E; 3]) -> [E; 3] {
+    let mut out = *vectors;
+    for (column, out) in m.0.iter().zip(&mut out) {
+        *out = sum(vectors, column.0);
+    }
+    out
 }
 
 impl Step {
@@ -158,57 +158,61 @@ impl Step {
             slope: lanes(slope.n * motion, slope.f * motion, weight),
         }
     }
-
-    /// `K` of the axes of a ball joint, the first of which is `first`, among themselves.
-    #[inline(always)]
-    pub(crate) fn within_ball(
-        &self,
-        mechanics: &Mechanics,
-        gravity: Option<Vec3>,
-        first: usize,
-        weights: &Weights,
-    ) -> Mat3 {
-        let Self { motion, half, inverse, .. } = *self;
-        let Weights { momentum, torque, column, own } = weights;
-        let Mechanics { momenta, curvature, .. } = mechanics;
-        let Within { tau_z, tau_v, m_v } = curvature.within_ball(momenta, gravity, first);
-        let turned = tau_z.times(column).scaled(0.5 * half).plus(&tau_v.scaled(motion));
-        let moved = tau_v.transpose().times(column).scaled(motion).plus(&m_v.scaled(inverse));
-        torque.times(&turned).minus(&momentum.times(&moved)).plus(own)
-    }
 }
 
-impl Parts {
+impl<E: Eight> Parts<E> {
+    #[inline(always)]
+    pub(crate) fn of(parts: &Parts) -> Self {
+        let Parts { axis, rate, force, slope } = parts;
+        let [axis, rate] = [E::of(axis), E::of(rate)];
+        let [force, slope] = [E::of(force), E::of(slope)];
+        Self { axis, rate, force, slope }
+    }
+
     /// Of a hinge, a slide or a screw.
     #[inline(always)]
-    pub(crate) fn generators(&self) -> Generators {
-        let Self { axis, rate, force, slope } = self;
+    pub(crate) fn generators(&self) -> Generators<E> {
+        let Self { axis, rate, force, slope } = *self;
         Generators {
-            minus: rate.plus(axis.times(-1.0)),
-            plus: rate.plus(*axis),
-            upper: slope.plus(*force),
-            lower: slope.plus(force.times(-1.0)),
+            minus: rate.minus(axis),
+            plus: rate.plus(axis),
+            upper: slope.plus(force),
+            lower: slope.minus(force),
         }
     }
 }
 
-/// Of the three axes of a ball joint.
+/// Of the three axes of a ball joint, and `K` of these among themselves.
 #[inline(always)]
-pub(crate) fn of_ball(parts: &[Parts; 3], weights: &Weights) -> [Generators; 3] {
-    let Weights { momentum, torque, column, .. } = weights;
+pub(crate) fn of_ball<E: Eight>(
+    parts: &[Parts<E>; 3],
+    weights: &Weights,
+) -> ([Generators<E>; 3], [[f64; 3]; 3]) {
+    let Weights { momentum, torque, column, own } = weights;
     let [p, q, r] = parts;
     let (axis, rate) = ([p.axis, q.axis, r.axis], [p.rate, q.rate, r.rate]);
     let (force, slope) = ([p.force, q.force, r.force], [p.slope, q.slope, r.slope]);
-    let (rates, axes) = (rows(torque, &rate), rows(momentum, &axis));
-    let (slopes, forces) = (rows(torque, &slope), rows(momentum, &force));
-    let (rate, slope) = (columns(column, &rate), columns(column, &slope));
-    let of = |a: usize| Generators {
-        minus: rates[a].plus(axes[a].times(-1.0)),
-        plus: rate[a].plus(axis[a]),
-        upper: slope[a].plus(force[a]),
-        lower: slopes[a].plus(forces[a].times(-1.0)),
-    };
-    [of(0), of(1), of(2)]
+    let [rates, slopes] = [rows(torque, &rate), rows(torque, &slope)];
+    let [axes, forces] = [rows(momentum, &axis), rows(momentum, &force)];
+    let [rate, slope] = [columns(column, &rate), columns(column, &slope)];
+    let mut generators = [p.generators(), q.generators(), r.generators()];
+    for (a, generators) in generators.iter_mut().enumerate() {
+        *generators = Generators {
+            minus: rates[a].minus(axes[a]),
+            plus: rate[a].plus(axis[a]),
+            upper: slope[a].plus(force[a]),
+            lower: slopes[a].minus(forces[a]),
+        };
+    }
+    let mut within = [[0.0; 3]; 3];
+    for (a, row) in within.iter_mut().enumerate() {
+        for (b, entry) in row.iter_mut().enumerate() {
+            let turned = generators[a].lower.times(rate[b]);
+            let moved = rates[a].times(force[b]).minus(forces[a].times(axis[b]));
+            *entry = turned.plus(moved).sum() + own.0[b].0[a];
+        }
+    }
+    (generators, within)
 }
 
 /// What a joint gives to the linearization of a step.
@@ -230,7 +234,7 @@ impl Flanks {
     #[inline(always)]
     pub(crate) fn of(parts: &Parts) -> Self {
         let Parts { rate, slope, .. } = parts;
-        let [rate, slope] = [rate.times(2.0), slope.times(2.0)];
+        let [rate, slope] = [rate.scaled(2.0), slope.scaled(2.0)];
         let newton = parts.generators();
         let (parts, is_turned) = (*parts, false);
         Self { parts, is_turned, newton, carry: rate, push: slope, above: rate, below: slope }
@@ -238,9 +242,9 @@ impl Flanks {
 
     #[inline(always)]
     pub(crate) fn of_ball(parts: &[Parts; 3], turning: &Turning, weights: &Weights) -> [Self; 3] {
-        let newton = of_ball(parts, weights);
+        let (newton, _) = of_ball(parts, weights);
         let [p, q, r] = parts;
-        let twice = |of: fn(&Parts) -> Block| [of(p), of(q), of(r)].map(|part| part.times(2.0));
+        let twice = |of: fn(&Parts) -> Block| [of(p), of(q), of(r)].map(|part| part.scaled(2.0));
         let [rate, slope] = [twice(|part| part.rate), twice(|part| part.slope)];
         let spin = turning.spin();
         let axes = rows(&spin, &[p.axis, q.axis, r.axis]);

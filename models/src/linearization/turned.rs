@@ -14,6 +14,7 @@
 //! [`generators`](crate::lagrangian::generators); springs and forces come entry by entry, and each goes to all
 //! rows and columns of the ball joints that it belongs to.
 
+use plantd_math::eights::Eight;
 use plantd_math::rotation;
 use plantd_math::simd::widest;
 use plantd_math::spatial::{Mat3, three};
@@ -21,7 +22,7 @@ use plantd_math::spatial::{Mat3, three};
 use crate::integrator::balls::BallJoints;
 use crate::integrator::workspace::{StepContext, Tangents, Workspace};
 use crate::lagrangian::curvature::Within;
-use crate::lagrangian::generators::{Parts, dot};
+use crate::lagrangian::generators::Parts;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::turning::Turning;
 use crate::linearization::linearize::Linearization;
@@ -153,7 +154,7 @@ impl Sink<'_> {
                     // ¼h L_qq, ½ L_vq and ½ L_qv.
                     let Parts { axis, rate, .. } = &a.parts;
                     let Parts { force, slope, .. } = &d.parts;
-                    let [qq, vq, qv] = [dot(rate, slope), dot(axis, slope), dot(rate, force)];
+                    let [qq, vq, qv] = [rate.dot(*slope), axis.dot(*slope), rate.dot(*force)];
                     let (half, vq, qv) = (2.0 * qq, 2.0 * vq, 2.0 * qv);
                     increment[i * stride + j] = half - vq;
                     increment[j * stride + i] = half - qv;
@@ -163,12 +164,12 @@ impl Sink<'_> {
                     momentum[j * stride + i] = 2.0 * half;
                     continue;
                 }
-                increment[i * stride + j] = dot(&a.newton.minus, &d.below);
-                increment[j * stride + i] = dot(&a.above, &d.newton.lower);
-                momentum[i * stride + j] = dot(&a.carry, &d.below);
-                momentum[j * stride + i] = dot(&a.above, &d.push);
-                end_slopes[i * nd + j] = dot(&a.carry, &d.newton.upper);
-                end_slopes[j * nd + i] = dot(&a.newton.plus, &d.push);
+                increment[i * stride + j] = a.newton.minus.dot(d.below);
+                increment[j * stride + i] = a.above.dot(d.newton.lower);
+                momentum[i * stride + j] = a.carry.dot(d.below);
+                momentum[j * stride + i] = a.above.dot(d.push);
+                end_slopes[i * nd + j] = a.carry.dot(d.newton.upper);
+                end_slopes[j * nd + i] = a.newton.plus.dot(d.push);
             }
         });
     }
