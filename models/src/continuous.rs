@@ -398,7 +398,7 @@ impl Dimensions {
 
 /// The equations of motion and constraint accelerations at a point, with their first derivatives.
 #[derive(Clone, Debug)]
-struct Equations<S> {
+struct Equations<S: Scalar> {
     d: Dimensions,
     q: Vec<S>,
     v: Vec<S>,

@@ -5,18 +5,30 @@
 //! All kinds do the same operations in the same order: the bits are the same.
 
 #[cfg(target_arch = "x86_64")]
-use std::arch::x86_64::*;
+pub(crate) mod registers;
 
-use crate::rows::Block;
+#[cfg(target_arch = "x86_64")]
+use crate::eights::registers::{Halves, Whole};
+use crate::rows::{Block, sum_of_eight};
 #[cfg(target_arch = "x86_64")]
 use crate::simd::{AVX2, AVX512, has};
 
 /// Eight numbers.
-pub trait Eight: Copy {
+pub trait Eight: Copy + 'static {
+    /// The same, of which the first four are of use.
+    type Four: Eight;
+    /// Zeros.
+    const ZERO: Self;
+    /// Ones.
+    const ONE: Self;
     /// From memory.
     fn of(block: &Block) -> Self;
     /// To memory.
     fn put(self, block: &mut Block);
+    /// From a list of at least as many numbers as are of use.
+    fn of_list(list: &[f64]) -> Self;
+    /// To a list of at least as many.
+    fn put_list(self, list: &mut [f64]);
     /// The same number eight times.
     fn all(number: f64) -> Self;
     /// The sum, number by number.
@@ -27,6 +39,24 @@ pub trait Eight: Copy {
     fn times(self, o: Self) -> Self;
     /// The sum of all: of halves, of their halves, and of what is left.
     fn sum(self) -> f64;
+    /// The first numbers of all, the second ones, and so on.
+    fn transposed(rows: [Self; 8]) -> [Self; 8];
+    /// To rows: each gets one of all eight.
+    #[inline(always)]
+    fn spread(numbers: [Self; 8], rows: &mut [Block]) {
+        for (own, row) in Self::transposed(numbers).into_iter().zip(rows) {
+            own.put(row);
+        }
+    }
+    /// The way back.
+    #[inline(always)]
+    fn collect(rows: &[Block]) -> [Self; 8] {
+        let mut eight = [Self::ZERO; 8];
+        for (own, row) in eight.iter_mut().zip(rows) {
+            *own = Self::of(row);
+        }
+        Self::transposed(eight)
+    }
     /// All numbers times a factor.
     #[inline(always)]
     fn scaled(self, factor: f64) -> Self {
@@ -37,6 +67,11 @@ pub trait Eight: Copy {
     fn dot(self, o: Self) -> f64 {
         self.times(o).sum()
     }
+    /// The same, from memory.
+    #[inline(always)]
+    fn dot_of(a: &Block, b: &Block) -> f64 {
+        Self::of(a).dot(Self::of(b))
+    }
 }
 
 /// What is done with eight numbers at a time.
@@ -46,7 +81,6 @@ pub trait InEights {
     /// Does it. Always inlined, as is all that works on these numbers in it.
     fn run<E: Eight>(self) -> Self::Output;
 }
-
 /// Does it in the widest registers of the processor.
 #[inline(always)]
 pub fn in_eights<T: InEights>(task: T) -> T::Output {
@@ -73,9 +107,22 @@ pub fn in_eights<T: InEights>(task: T) -> T::Output {
 }
 
 impl Eight for Block {
+    type Four = Self;
+    const ZERO: Self = Self([0.0; 8]);
+    const ONE: Self = Self([1.0; 8]);
     #[inline(always)]
     fn of(block: &Block) -> Self {
         *block
+    }
+    #[inline(always)]
+    fn of_list(list: &[f64]) -> Self {
+        let mut block = Self::ZERO;
+        block.0.iter_mut().zip(list).for_each(|(own, number)| *own = *number);
+        block
+    }
+    #[inline(always)]
+    fn put_list(self, list: &mut [f64]) {
+        list.iter_mut().zip(self.0).for_each(|(number, own)| *number = own);
     }
     #[inline(always)]
     fn put(self, block: &mut Block) {
@@ -98,139 +145,44 @@ impl Eight for Block {
         Self(std::array::from_fn(|i| self.0[i] * o.0[i]))
     }
     #[inline(always)]
-    fn sum(self) -> f64 {
-        let half = |i: usize| self.0[i] + self.0[i + 4];
-        let quarter = |i: usize| half(i) + half(i + 2);
-        quarter(0) + quarter(1)
-    }
-}
-
-/// A register of eight numbers; made within [`in_eights`] alone, where the processor has AVX-512.
-#[cfg(target_arch = "x86_64")]
-#[derive(Clone, Copy)]
-struct Whole(__m512d);
-
-/// Two registers of four numbers; made within [`in_eights`] alone, where the processor has AVX2.
-#[cfg(target_arch = "x86_64")]
-#[derive(Clone, Copy)]
-struct Halves([__m256d; 2]);
-
-#[cfg(target_arch = "x86_64")]
-impl Eight for Whole {
-    #[inline(always)]
-    fn of(block: &Block) -> Self {
-        // SAFETY: there are such registers, and a block is aligned to 64 bytes.
-        Self(unsafe { _mm512_load_pd(block.0.as_ptr()) })
-    }
-    #[inline(always)]
-    fn put(self, block: &mut Block) {
-        // SAFETY: as above.
-        unsafe { _mm512_store_pd(block.0.as_mut_ptr(), self.0) }
-    }
-    #[inline(always)]
-    fn all(number: f64) -> Self {
-        // SAFETY: there are such registers.
-        Self(unsafe { _mm512_set1_pd(number) })
-    }
-    #[inline(always)]
-    fn plus(self, o: Self) -> Self {
-        // SAFETY: there are such registers.
-        Self(unsafe { _mm512_add_pd(self.0, o.0) })
-    }
-    #[inline(always)]
-    fn minus(self, o: Self) -> Self {
-        // SAFETY: there are such registers.
-        Self(unsafe { _mm512_sub_pd(self.0, o.0) })
-    }
-    #[inline(always)]
-    fn times(self, o: Self) -> Self {
-        // SAFETY: there are such registers.
-        Self(unsafe { _mm512_mul_pd(self.0, o.0) })
-    }
-    #[inline(always)]
-    fn sum(self) -> f64 {
-        // SAFETY: there are such registers.
-        unsafe {
-            let halves = [_mm512_castpd512_pd256(self.0), _mm512_extractf64x4_pd::<1>(self.0)];
-            sum(_mm256_add_pd(halves[0], halves[1]))
+    fn transposed(rows: [Self; 8]) -> [Self; 8] {
+        let mut out = rows;
+        for (i, row) in out.iter_mut().enumerate() {
+            for (entry, from) in row.0.iter_mut().zip(&rows) {
+                *entry = from.0[i];
+            }
         }
-    }
-}
-
-#[cfg(target_arch = "x86_64")]
-impl Eight for Halves {
-    #[inline(always)]
-    fn of(block: &Block) -> Self {
-        let [low, high] = [0, 4].map(|half| block.0[half..].as_ptr());
-        // SAFETY: there are such registers, and halves of a block are aligned to 32 bytes.
-        Self(unsafe { [_mm256_load_pd(low), _mm256_load_pd(high)] })
-    }
-    #[inline(always)]
-    fn put(self, block: &mut Block) {
-        let (low, high) = block.0.split_at_mut(4);
-        // SAFETY: as above.
-        unsafe {
-            _mm256_store_pd(low.as_mut_ptr(), self.0[0]);
-            _mm256_store_pd(high.as_mut_ptr(), self.0[1]);
-        }
-    }
-    #[inline(always)]
-    fn all(number: f64) -> Self {
-        // SAFETY: there are such registers.
-        Self([unsafe { _mm256_set1_pd(number) }; 2])
-    }
-    #[inline(always)]
-    fn plus(self, o: Self) -> Self {
-        // SAFETY: there are such registers.
-        Self(unsafe { [_mm256_add_pd(self.0[0], o.0[0]), _mm256_add_pd(self.0[1], o.0[1])] })
-    }
-    #[inline(always)]
-    fn minus(self, o: Self) -> Self {
-        // SAFETY: there are such registers.
-        Self(unsafe { [_mm256_sub_pd(self.0[0], o.0[0]), _mm256_sub_pd(self.0[1], o.0[1])] })
-    }
-    #[inline(always)]
-    fn times(self, o: Self) -> Self {
-        // SAFETY: there are such registers.
-        Self(unsafe { [_mm256_mul_pd(self.0[0], o.0[0]), _mm256_mul_pd(self.0[1], o.0[1])] })
+        out
     }
     #[inline(always)]
     fn sum(self) -> f64 {
-        // SAFETY: there are such registers.
-        unsafe { sum(_mm256_add_pd(self.0[0], self.0[1])) }
-    }
-}
-
-/// Of the halves, and of what is left. Needs AVX2.
-#[cfg(target_arch = "x86_64")]
-#[inline(always)]
-unsafe fn sum(four: __m256d) -> f64 {
-    // SAFETY: whoever calls has AVX2.
-    unsafe {
-        let two = _mm_add_pd(_mm256_castpd256_pd128(four), _mm256_extractf128_pd::<1>(four));
-        _mm_cvtsd_f64(_mm_add_sd(two, _mm_unpackhi_pd(two, two)))
+        sum_of_eight(self.0)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::simd::narrowly;
+    use crate::simd::{AVX2, AVX512, PORTABLE, within};
 
     /// All that eight numbers can, of two blocks.
     struct All<'a>([&'a Block; 2]);
 
     impl InEights for All<'_> {
-        type Output = [Block; 5];
+        type Output = [Block; 13];
         #[inline(always)]
-        fn run<E: Eight>(self) -> [Block; 5] {
+        fn run<E: Eight>(self) -> [Block; 13] {
             let [a, b] = self.0.map(|block| E::of(block));
-            let mut out = [Block::ZERO; 5];
+            let mut out = [Block::ZERO; 13];
             a.plus(b).put(&mut out[0]);
             a.minus(b).put(&mut out[1]);
             a.times(b).put(&mut out[2]);
             a.scaled(b.sum()).put(&mut out[3]);
             E::all(a.dot(b)).put(&mut out[4]);
+            let rows = [0, 1, 2, 3, 4, 5, 6, 7].map(|i| a.plus(b.scaled(f64::from(i))));
+            for (own, row) in E::transposed(rows).into_iter().zip(&mut out[5..]) {
+                own.put(row);
+            }
             out
         }
     }
@@ -239,12 +191,15 @@ mod tests {
     fn all_registers_give_the_same_bits() {
         let block = |seed: f64| Block(std::array::from_fn(|i| (seed + i as f64).sin() / 3.0));
         let (a, b) = (block(0.3), block(1.7));
-        let [wide, narrow] =
-            [in_eights(All([&a, &b])), narrowly(|| in_eights(All([&a, &b])))].map(|o| o.map(|b| b.0));
-        assert_eq!(wide, narrow);
+        let all = |registers| within(registers, || in_eights(All([&a, &b])).map(|b| b.0));
+        let wide = all(AVX512);
+        assert_eq!([wide, wide], [all(AVX2), all(PORTABLE)]);
         for i in 0..8 {
             let [x, y] = [a.0[i], b.0[i]];
             assert_eq!([wide[0][i], wide[1][i], wide[2][i]], [x + y, x - y, x * y]);
+            for (k, entry) in wide[5 + i].iter().enumerate() {
+                assert_eq!(*entry, x + y * k as f64);
+            }
         }
         let sum: f64 = a.0.iter().zip(&b.0).map(|(a, b)| a * b).sum();
         assert!((wide[4][3] - sum).abs() < 1e-15);

@@ -12,6 +12,7 @@ pub mod rotation;
 pub mod rows;
 
 pub mod scalar;
+pub mod sided;
 pub mod simd;
 pub mod sparse_map;
 pub mod spatial;

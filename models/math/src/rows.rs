@@ -1,6 +1,6 @@
 //! Row operations on row-major matrices whose rows are padded to whole blocks.
 
-use std::ops::{Deref, DerefMut};
+use std::ops::{Add, Deref, DerefMut};
 
 /// Rows are padded to a multiple of this, and worked on in blocks of it.
 pub const LANES: usize = 8;
@@ -33,6 +33,14 @@ impl Block {
         }
         Self(product)
     }
+}
+
+/// The sum of halves, of their halves, and of what is left.
+#[inline(always)]
+pub(crate) fn sum_of_eight<S: Copy + Add<Output = S>>(numbers: [S; 8]) -> S {
+    let half = |i: usize| numbers[i] + numbers[i + 4];
+    let quarter = |i: usize| half(i) + half(i + 2);
+    quarter(0) + quarter(1)
 }
 
 /// Rows that begin with a cache line, so that no block lies in two.

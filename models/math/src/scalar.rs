@@ -3,11 +3,18 @@
 //! First derivatives are written out; the second-order linearization runs the same code with
 //! [`Dual`] numbers, which differentiates it exactly, to round-off.
 
+mod beside;
+
 use std::fmt::Debug;
 use std::ops::{Add, AddAssign, BitAnd, BitOr, Div, Mul, Neg, Not, Sub, SubAssign};
 
-use crate::simd::{in_eights, wide};
+use crate::eights::Eight;
+use crate::rows::{Block, sum_of_eight};
+use crate::simd::{in_avx512, wide};
 use crate::trigonometry;
+
+pub use beside::{Beside, Wide};
+use beside::{in_plants, in_sides};
 
 /// Operators of a type: by what they make of one or two operands, and of what they put in its place.
 macro_rules! operators {
@@ -95,6 +102,26 @@ pub trait Scalar:
     fn in_registers<R>(block: impl FnOnce() -> R) -> R {
         wide!({ block() })
     }
+    /// Several of these numbers side by side, in memory, where that is faster: eight reals, or the number itself.
+    type Several: Copy + Default + Debug;
+    /// How many those are.
+    const BESIDE: usize;
+    /// Eight numbers that belong together, in memory.
+    type Row: Copy + Default + Debug;
+    /// Numbers side by side.
+    fn several(of: impl Fn(usize) -> Self) -> Self::Several;
+    /// One of them.
+    fn one(several: &Self::Several, lane: usize) -> Self;
+    /// Replaces one of them.
+    fn put(self, several: &mut Self::Several, lane: usize);
+    /// One of the numbers of a row.
+    fn entry(row: &Self::Row, k: usize) -> Self;
+    /// The sum of the products of two rows.
+    fn dot(a: &Self::Row, b: &Self::Row) -> Self;
+    /// The same, where the last two numbers of one of them are zero.
+    fn dot_of_six(a: &Self::Row, b: &Self::Row) -> Self;
+    /// Does what is done with numbers side by side, so many of which are in a list.
+    fn beside<T: Beside<Self>>(count: usize, task: T) -> T::Output;
     /// `(sin x, cos x)`.
     fn sin_cos(self) -> (Self, Self);
     /// Writes `sin x` and `cos x` of each.
@@ -115,6 +142,41 @@ pub trait Scalar:
 }
 
 impl Scalar for f64 {
+    type Several = Block;
+    type Row = Block;
+    const BESIDE: usize = 8;
+    #[inline(always)]
+    fn several(of: impl Fn(usize) -> Self) -> Block {
+        let mut several = Block::ZERO;
+        for (lane, number) in several.0.iter_mut().enumerate() {
+            *number = of(lane);
+        }
+        several
+    }
+    #[inline(always)]
+    fn one(several: &Block, lane: usize) -> Self {
+        several.0[lane]
+    }
+    #[inline(always)]
+    fn put(self, several: &mut Block, lane: usize) {
+        several.0[lane] = self;
+    }
+    #[inline(always)]
+    fn entry(row: &Block, k: usize) -> Self {
+        row.0[k]
+    }
+    #[inline(always)]
+    fn dot(a: &Block, b: &Block) -> Self {
+        Eight::dot(*a, *b)
+    }
+    #[inline(always)]
+    fn dot_of_six(a: &Block, b: &Block) -> Self {
+        Eight::dot(*a, *b)
+    }
+    #[inline(always)]
+    fn beside<T: Beside<Self>>(count: usize, task: T) -> T::Output {
+        in_sides(count, task)
+    }
     const ZERO: Self = 0.0;
     const ONE: Self = 1.0;
     #[inline(always)]
@@ -170,6 +232,43 @@ impl<S: Scalar> Dual<S> {
 }
 
 impl<S: Scalar> Scalar for Dual<S> {
+    type Several = Self;
+    type Row = [Self; 8];
+    const BESIDE: usize = 1;
+    #[inline(always)]
+    fn several(of: impl Fn(usize) -> Self) -> Self {
+        of(0)
+    }
+    #[inline(always)]
+    fn one(several: &Self, _: usize) -> Self {
+        *several
+    }
+    #[inline(always)]
+    fn put(self, several: &mut Self, _: usize) {
+        *several = self;
+    }
+    #[inline(always)]
+    fn entry(row: &[Self; 8], k: usize) -> Self {
+        row[k]
+    }
+    #[inline(always)]
+    fn dot(a: &[Self; 8], b: &[Self; 8]) -> Self {
+        let mut products = *a;
+        for (product, b) in products.iter_mut().zip(b) {
+            *product = *product * *b;
+        }
+        sum_of_eight(products)
+    }
+    #[inline(always)]
+    fn dot_of_six(a: &[Self; 8], b: &[Self; 8]) -> Self {
+        let product = |k: usize| a[k] * b[k];
+        let half = |k: usize| product(k) + product(k + 4);
+        (half(0) + product(2)) + (half(1) + product(3))
+    }
+    #[inline(always)]
+    fn beside<T: Beside<Self>>(_: usize, task: T) -> T::Output {
+        Self::in_registers(|| task.run::<Self>())
+    }
     const ZERO: Self = Self { re: S::ZERO, eps: S::ZERO };
     const ONE: Self = Self { re: S::ONE, eps: S::ZERO };
     #[inline(always)]
@@ -287,6 +386,43 @@ impl<const N: usize> LanesOf<N> {
 }
 
 impl<const N: usize> Scalar for LanesOf<N> {
+    type Several = Self;
+    type Row = [Self; 8];
+    const BESIDE: usize = 1;
+    #[inline(always)]
+    fn several(of: impl Fn(usize) -> Self) -> Self {
+        of(0)
+    }
+    #[inline(always)]
+    fn one(several: &Self, _: usize) -> Self {
+        *several
+    }
+    #[inline(always)]
+    fn put(self, several: &mut Self, _: usize) {
+        *several = self;
+    }
+    #[inline(always)]
+    fn entry(row: &[Self; 8], k: usize) -> Self {
+        row[k]
+    }
+    #[inline(always)]
+    fn dot(a: &[Self; 8], b: &[Self; 8]) -> Self {
+        let mut products = *a;
+        for (product, b) in products.iter_mut().zip(b) {
+            *product = *product * *b;
+        }
+        sum_of_eight(products)
+    }
+    #[inline(always)]
+    fn dot_of_six(a: &[Self; 8], b: &[Self; 8]) -> Self {
+        let product = |k: usize| a[k] * b[k];
+        let half = |k: usize| product(k) + product(k + 4);
+        (half(0) + product(2)) + (half(1) + product(3))
+    }
+    #[inline(always)]
+    fn beside<T: Beside<Self>>(_: usize, task: T) -> T::Output {
+        in_plants(task)
+    }
     const ZERO: Self = Self([0.0; N]);
     const ONE: Self = Self([1.0; N]);
     const IS_SEVERAL: bool = true;
@@ -296,7 +432,7 @@ impl<const N: usize> Scalar for LanesOf<N> {
     }
     #[inline(always)]
     fn in_registers<R>(block: impl FnOnce() -> R) -> R {
-        if const { N > Lanes::COUNT } { in_eights(block) } else { wide!({ block() }) }
+        if const { N > Lanes::COUNT } { in_avx512(block) } else { wide!({ block() }) }
     }
     /// Of the first: nothing that branches on it may run on several numbers.
     #[inline(always)]

@@ -48,7 +48,7 @@ pub use {wide, widest};
 ///
 /// On an x86 processor without it: ask [`has`] before.
 #[inline(always)]
-pub(crate) fn in_eights<R>(block: impl FnOnce() -> R) -> R {
+pub(crate) fn in_avx512<R>(block: impl FnOnce() -> R) -> R {
     #[cfg(target_arch = "x86_64")]
     {
         #[target_feature(enable = "avx512f")]
@@ -73,7 +73,7 @@ pub const AVX512: u8 = 3;
 /// The widest registers that blocks may use; 0 until the processor has been asked.
 static REGISTERS: AtomicU8 = AtomicU8::new(0);
 
-/// Whether blocks may use these registers: the processor has them, and it is not within [`narrowly`].
+/// Whether blocks may use these registers: the processor has them, and it is not [`within`] fewer.
 #[inline(always)]
 pub fn has(registers: u8) -> bool {
     let widest = REGISTERS.load(Ordering::Relaxed);
@@ -98,8 +98,13 @@ fn ask_the_processor() -> u8 {
 
 /// Runs the code for all processors, in all threads: for tests that compare it with the wider code.
 pub fn narrowly<R>(run: impl FnOnce() -> R) -> R {
+    within(PORTABLE, run)
+}
+
+/// Runs the code for processors with these registers, or fewer where this one has fewer, in all threads: for tests.
+pub fn within<R>(registers: u8, run: impl FnOnce() -> R) -> R {
     let before = ask_the_processor();
-    REGISTERS.store(PORTABLE, Ordering::Relaxed);
+    REGISTERS.store(before.min(registers), Ordering::Relaxed);
     let result = run();
     REGISTERS.store(before, Ordering::Relaxed);
     result

@@ -131,6 +131,12 @@ impl<S: Scalar> Mat3<S> {
         Vec3([self.0[0].dot(v), self.0[1].dot(v), self.0[2].dot(v)])
     }
 
+    /// An entry of `self * oᵀ`.
+    #[inline(always)]
+    fn entry_of_product(&self, o: &Self, i: usize, j: usize) -> S {
+        self.0[0][i] * o.0[0][j] + self.0[1][i] * o.0[1][j] + self.0[2][i] * o.0[2][j]
+    }
+
     /// `self * o`.
     #[inline(always)]
     pub fn times(&self, o: &Self) -> Self {
@@ -204,22 +210,19 @@ impl<S: Scalar> Sym3<S> {
             r.0[0] * self.xy + r.0[1] * self.yy + r.0[2] * self.yz,
             r.0[0] * self.xz + r.0[1] * self.yz + r.0[2] * self.zz,
         ]);
-        let entry = |i: usize, j: usize| {
-            t.0[0][i] * r.0[0][j] + t.0[1][i] * r.0[1][j] + t.0[2][i] * r.0[2][j]
-        };
         Self {
-            xx: entry(0, 0),
-            yy: entry(1, 1),
-            zz: entry(2, 2),
-            xy: entry(0, 1),
-            xz: entry(0, 2),
-            yz: entry(1, 2),
+            xx: t.entry_of_product(r, 0, 0),
+            yy: t.entry_of_product(r, 1, 1),
+            zz: t.entry_of_product(r, 2, 2),
+            xy: t.entry_of_product(r, 0, 1),
+            xz: t.entry_of_product(r, 0, 2),
+            yz: t.entry_of_product(r, 1, 2),
         }
     }
 
     /// `mass (|c|² 1 − c cᵀ)`: the inertia about the origin of a point mass at `c`.
     #[inline(always)]
-    pub fn of_point(mass: f64, c: Vec3<S>) -> Self {
+    pub fn of_point(mass: S, c: Vec3<S>) -> Self {
         let (x, y, z) = (c[0] * mass, c[1] * mass, c[2] * mass);
         let (xx, yy, zz) = (x * c[0], y * c[1], z * c[2]);
         Self {
@@ -247,6 +250,12 @@ impl<S: Scalar> Motion<S> {
     #[inline(always)]
     pub fn add_scaled(self, s: S, o: Self) -> Self {
         Self { w: self.w + o.w * s, v: self.v + o.v * s }
+    }
+
+    /// `s self`.
+    #[inline(always)]
+    pub fn scaled(self, s: S) -> Self {
+        Self { w: self.w * s, v: self.v * s }
     }
 
     /// Velocity of the body's point at `x`, which is measured from the origin.
@@ -307,7 +316,7 @@ impl<S: Scalar> Force<S> {
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Inertia<S = f64> {
     /// Mass.
-    pub mass: f64,
+    pub mass: S,
     /// First moment of mass: mass times the centre of mass.
     pub moment: Vec3<S>,
     /// Inertia tensor about the origin.
@@ -320,8 +329,29 @@ impl<S: Scalar> Inertia<S> {
     pub fn momentum(&self, motion: Motion<S>) -> Force<S> {
         Force {
             n: self.tensor.apply(motion.w) + self.moment.cross(motion.v),
-            f: motion.v * S::constant(self.mass) - self.moment.cross(motion.w),
+            f: motion.v * self.mass - self.moment.cross(motion.w),
         }
+    }
+}
+
+/// A pose: the columns of its rotation, and where it is.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Pose<S = f64> {
+    /// First column.
+    pub x: Vec3<S>,
+    /// Second column.
+    pub y: Vec3<S>,
+    /// Third column.
+    pub z: Vec3<S>,
+    /// Position.
+    pub at: Vec3<S>,
+}
+
+impl<S: Scalar> Pose<S> {
+    /// Its rotation.
+    #[inline(always)]
+    pub fn rotation(&self) -> Mat3<S> {
+        Mat3([self.x, self.y, self.z])
     }
 }
 

@@ -17,7 +17,7 @@ const TOLERANCE: f64 = 1e-6;
 
 /// The constraints at a configuration.
 #[derive(Clone, Debug)]
-pub(crate) struct Closure<S = f64> {
+pub(crate) struct Closure<S: Scalar = f64> {
     pub(crate) poses: Poses<S>,
     /// Values `h`, one per equation.
     pub(crate) value: Vec<S>,

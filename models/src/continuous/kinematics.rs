@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use nalgebra::DMatrix;
 use plantd_math::rotation::Quaternion;
-use plantd_math::spatial::{Inertia, Mat3, Motion, Sym3, Vec3};
+use plantd_math::spatial::{Force, Inertia, Mat3, Motion, Sym3, Vec3};
 
 use crate::compile::scene::{Placement, frames};
 use crate::continuous::{ContinuousError, take};
@@ -133,10 +133,13 @@ impl Kinematics {
         take("v", v, &mut self.v)?;
         self.evaluate();
         let finite = |v: &Vec3| v.0.iter().all(|x| x.is_finite());
-        let moves = |twist: &Motion| finite(&twist.w) && finite(&twist.v);
+        let moves = |i: usize| {
+            let (twist, momentum) = (self.momenta.twist.get(i), self.momenta.momentum.get(i));
+            let (Motion { w, v }, Force { f, .. }) = (twist, momentum);
+            [w, v, f].iter().all(finite)
+        };
         let all_finite = self.poses.position.iter().chain(&self.poses.origin).all(finite)
-            && self.momenta.twist.iter().all(moves)
-            && self.momenta.momentum.iter().all(|momentum| finite(&momentum.f));
+            && (0..self.tree.joints.len()).all(moves);
         if all_finite { Ok(()) } else { Err(ContinuousError::Overflow) }
     }
 
@@ -153,7 +156,7 @@ impl Kinematics {
         let (position, origin) = self.poses.point(&self.tree, at);
         let (axes, twist) = match at.joint {
             WORLD => (*rotation, Motion::default()),
-            joint => (self.poses.rotation[joint].times(rotation), self.momenta.twist[joint]),
+            joint => (self.poses.rotation[joint].times(rotation), self.momenta.twist.get(joint)),
         };
         FrameMotion {
             position: (position + origin).0,
@@ -170,7 +173,7 @@ impl Kinematics {
         let (position, _) = self.poses.point(&self.tree, &point.at);
         for joint in self.tree.path(point.at.joint) {
             let linear = self.poses.point_gradient(&self.tree, joint, position);
-            let angular = self.momenta.axis[joint].w;
+            let angular = self.momenta.axis.get::<f64>(joint).w;
             let mut column = jacobian.column_mut(self.tree.joints[joint].coordinate);
             for k in 0..3 {
                 column[k] = linear[k];
@@ -193,9 +196,9 @@ impl Kinematics {
         let mut jacobian = DMatrix::zeros(3, self.q.len());
         let mass = self.center_of_mass().mass_kg;
         for (i, joint) in self.tree.joints.iter().enumerate().filter(|_| mass > 0.0) {
-            let (moment, tensor) = (self.momenta.moment[i], Sym3::default());
+            let (moment, tensor) = (self.momenta.moment.get(i), Sym3::default());
             let carried = Inertia { mass: joint.subtree_mass, moment, tensor };
-            let momentum = carried.momentum(self.momenta.axis[i]);
+            let momentum = carried.momentum(self.momenta.axis.get(i));
             for k in 0..3 {
                 jacobian[(k, joint.coordinate)] = momentum.f[k] / mass;
             }

@@ -13,18 +13,18 @@
 //! a whole turn in one step. In the Newton matrix the maps weigh rows and columns of the joint: see
 //! [`crate::lagrangian::generators`]. See [`plantd_math::rotation`] for the maps.
 
+use plantd_math::eights::{Eight, InEights, in_eights};
 use plantd_math::rotation;
 use plantd_math::rotation::{Quaternion, Turn};
-use plantd_math::eights::Eight;
-use plantd_math::simd::widest;
 use plantd_math::spatial::{Mat3, Vec3, three};
+use plantd_math::tree_lu::TreeLu;
 
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::{Tangents, Workspace};
 use crate::lagrangian::armature;
-use crate::lagrangian::generators::{Flanks, Generators, MatrixKind, Step, Vertical, of_ball};
-use crate::lagrangian::mechanics::Mechanics;
+use crate::lagrangian::curvature::Curvature;
+use crate::lagrangian::generators::{Flanks, Generators, MatrixKind, Step, of_ball};
 use crate::lagrangian::turning::{Turning, Weights};
 use crate::model::mechanism::Model;
 use crate::model::tree::JointKind;
@@ -42,7 +42,6 @@ pub(crate) struct BallJoints {
     pub(crate) turns: Vec<Turn>,
     /// Of each coordinate the orientation that it is a component of, times four, and the axis.
     places: Vec<u32>,
-    pub(crate) vertical: Vertical,
     /// Of the joints at the midpoint.
     generators: Vec<Generators>,
     /// What the axes of each ball joint have among themselves.
@@ -62,7 +61,6 @@ impl BallJoints {
             end: vec![Mat3::IDENTITY; no],
             turns: vec![Turn::new(Vec3::ZERO); no],
             places,
-            vertical: Vertical::new(model),
             generators: vec![Generators::default(); if no > 0 { joints } else { 0 }],
             within: vec![[[0.0; 3]; 3]; no],
         }
@@ -195,44 +193,24 @@ impl Workspace {
         self.mid.mechanics.differentiate(model);
         self.weigh_balls(model, settings);
         let Self { mid, kkt, balls, .. } = self;
-        let (matrix, weights) = (&mut kkt.factored.tree, &kkt.balls);
-        widest!({
-            let step = Step::new(&balls.vertical, h, MatrixKind::Newton);
-            let generators = &mut balls.generators[..];
-            for (i, joint) in model.dynamics.joints.iter().enumerate() {
-                match joint.kind {
-                    JointKind::Ball(0) if joint.coordinate < nd => {
-                        let parts = step.parts_of_ball(&mid.mechanics, i);
-                        let o = joint.orientation;
-                        let (own, among) = of_ball(&parts, &weights[o]);
-                        generators[i..i + 3].copy_from_slice(&own);
-                        balls.within[o] = among;
-                    }
-                    JointKind::Ball(_) => {}
-                    _ => generators[i] = step.parts(&mid.mechanics, i).generators(),
-                }
+        let (matrix, weights) = (&mut kkt.factored.tree, &kkt.balls[..]);
+        let step = Step::new(h, MatrixKind::Newton);
+        let BallJoints { generators, within, .. } = balls;
+        let curvature = &mid.mechanics.curvature;
+        in_eights(FillTurned { model, step, curvature, weights, generators, within, matrix });
+        for joint in &model.dynamics.joints {
+            if joint.kind != JointKind::Ball(0) || joint.coordinate >= nd {
+                continue;
             }
-            for pair in &model.pairs {
-                let (i, j) = (pair.ancestor as usize, pair.descendant as usize);
-                matrix.upper[pair.slot as usize] = generators[i].minus.dot(generators[j].upper);
-                matrix.lower[pair.slot as usize] = generators[i].plus.dot(generators[j].lower);
+            let own = &balls.within[joint.orientation];
+            for (row, column) in [(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)] {
+                // The axes of a joint come last among those that its rows are coupled with.
+                let end = model.elimination.offsets[joint.coordinate + row + 1];
+                let slot = end - 1 - row + column;
+                matrix.upper[slot] = own[column][row];
+                matrix.lower[slot] = own[row][column];
             }
-            for joint in &model.dynamics.joints {
-                if joint.kind != JointKind::Ball(0) || joint.coordinate >= nd {
-                    continue;
-                }
-                let own = &balls.within[joint.orientation];
-                for row in 0..3 {
-                    // The axes of a joint come last among those that its rows are coupled with.
-                    let end = model.elimination.offsets[joint.coordinate + row + 1];
-                    for column in 0..=row {
-                        let slot = end - 1 - row + column;
-                        matrix.upper[slot] = own[column][row];
-                        matrix.lower[slot] = own[row][column];
-                    }
-                }
-            }
-        });
+        }
         self.add_elements_to_turned_matrix(model, settings);
     }
 
@@ -309,32 +287,89 @@ impl Workspace {
     }
 }
 
+/// The generators of all joints, `K` of ball joints by themselves, and of pairs.
+struct FillTurned<'a> {
+    model: &'a Model,
+    step: Step,
+    curvature: &'a Curvature,
+    weights: &'a [Weights],
+    generators: &'a mut [Generators],
+    within: &'a mut [[[f64; 3]; 3]],
+    matrix: &'a mut TreeLu,
+}
+
+impl InEights for FillTurned<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<E: Eight>(self) {
+        let Self { model, step, curvature, weights, generators, within, matrix } = self;
+        for (i, joint) in model.dynamics.joints.iter().enumerate() {
+            match joint.kind {
+                JointKind::Ball(0) if joint.coordinate < model.dimensions.dynamic => {
+                    let (parts, o) = (step.parts_of_ball::<E>(curvature, i), joint.orientation);
+                    let (own, among) = of_ball(&parts, &weights[o]);
+                    within[o] = among;
+                    for (own, to) in own.iter().zip(&mut generators[i..]) {
+                        own.put(to);
+                    }
+                }
+                JointKind::Ball(_) => {}
+                _ => step.parts::<E>(curvature, i).generators().put(&mut generators[i]),
+            }
+        }
+        for pair in &model.pairs {
+            let (a, d) =
+                (&generators[pair.ancestor as usize], &generators[pair.descendant as usize]);
+            matrix.upper[pair.slot as usize] = E::dot_of(&a.minus, &d.upper);
+            matrix.lower[pair.slot as usize] = E::dot_of(&a.plus, &d.lower);
+        }
+    }
+}
+
+/// What [`Tangents::find_flanks`] does.
+struct FindFlanks<'a> {
+    model: &'a Model,
+    step: Step,
+    curvature: &'a Curvature,
+    turnings: &'a [Turning],
+    weights: &'a [Weights],
+    flanks: &'a mut [Flanks],
+}
+
+impl InEights for FindFlanks<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<E: Eight>(self) {
+        let Self { model, step, curvature, turnings, weights, flanks } = self;
+        for (i, joint) in model.dynamics.joints.iter().enumerate() {
+            match joint.kind {
+                JointKind::Ball(0) if joint.coordinate < model.dimensions.dynamic => {
+                    let (parts, o) = (step.parts_of_ball::<E>(curvature, i), joint.orientation);
+                    let own = Flanks::of_ball(&parts, &turnings[o], &weights[o]);
+                    for (own, to) in own.iter().zip(&mut flanks[i..]) {
+                        own.put(to);
+                    }
+                }
+                JointKind::Ball(_) => {}
+                _ => Flanks::of(&step.parts::<E>(curvature, i)).put(&mut flanks[i]),
+            }
+        }
+    }
+}
+
 impl Tangents {
     /// What joints give to the linearization, at the second derivatives of `mechanics`.
     #[inline(never)]
     pub(crate) fn find_flanks(
         &mut self,
         model: &Model,
-        mechanics: &Mechanics,
+        curvature: &Curvature,
         (turnings, weights): (&[Turning], &[Weights]),
-        vertical: &Vertical,
         h: f64,
     ) {
-        let flanks = &mut self.flanks[..];
-        widest!({
-            let step = Step::new(vertical, h, MatrixKind::Newton);
-            for (i, joint) in model.dynamics.joints.iter().enumerate() {
-                match joint.kind {
-                    JointKind::Ball(0) if joint.coordinate < model.dimensions.dynamic => {
-                        let parts = step.parts_of_ball(mechanics, i);
-                        let o = joint.orientation;
-                        let own = Flanks::of_ball(&parts, &turnings[o], &weights[o]);
-                        flanks[i..i + 3].copy_from_slice(&own);
-                    }
-                    JointKind::Ball(_) => {}
-                    _ => flanks[i] = Flanks::of(&step.parts(mechanics, i)),
-                }
-            }
-        });
+        let (step, flanks) = (Step::new(h, MatrixKind::Newton), &mut self.flanks[..]);
+        in_eights(FindFlanks { model, step, curvature, turnings, weights, flanks });
     }
 }

@@ -34,7 +34,7 @@ use crate::model::mechanism::Model;
 /// Ball joints weigh their rows and columns with the maps of their [`Turning`]; what is next of a
 /// prescribed one is how it turns, too.
 #[derive(Clone, Debug)]
-pub(crate) struct StepBlocks<S = f64> {
+pub(crate) struct StepBlocks<S: Scalar = f64> {
     /// At the midpoint.
     pub(crate) mid: Derivatives<S>,
     /// Constraints at `q[k]` and at `q[k+1]`, with their Jacobians.

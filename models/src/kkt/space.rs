@@ -28,11 +28,10 @@ use std::ops::Range;
 
 use plantd_math::eights::{Eight, InEights, in_eights};
 use plantd_math::rows::Block;
-use plantd_math::simd::wide;
 use plantd_math::tree_lu::SmallestPivot;
 
-use crate::lagrangian::generators::{Generators, MatrixKind, Parts, Step, Vertical, of_ball};
-use crate::lagrangian::mechanics::Mechanics;
+use crate::lagrangian::curvature::Curvature;
+use crate::lagrangian::generators::{Generators, MatrixKind, Step, of_ball};
 use crate::lagrangian::turning::Weights;
 use crate::model::mechanism::Model;
 use crate::model::tree::{JointKind, Tree};
@@ -46,16 +45,6 @@ pub(crate) struct Added<'a> {
     /// On the diagonal, but for ball joints.
     pub(crate) diagonal: &'a [f64],
     pub(crate) balls: &'a [Weights],
-}
-
-/// What is left of an axis when it has been eliminated; before that, `upper` and `lower` stand in the last two.
-#[derive(Clone, Copy, Debug, Default)]
-struct Axis {
-    minus: Block,
-    plus: Block,
-    u: Block,
-    /// `D⁻¹ W`.
-    w_over_d: Block,
 }
 
 /// Axes one below the other that are eliminated at once: hinges, slides and screws, or those of a ball joint.
@@ -88,12 +77,11 @@ struct Fork {
 /// The Newton matrix of a tree in space, factored.
 #[derive(Clone, Debug)]
 pub(crate) struct SpatialRecursion {
-    vertical: Vertical,
     /// In the order of their elimination, as are groups.
     limbs: Vec<Limb>,
     groups: Vec<Group>,
-    parts: Vec<Parts>,
-    axes: Vec<Axis>,
+    /// Of axes that have been eliminated, `U` and `D⁻¹ W` stand in the place of `upper` and `lower`.
+    axes: Vec<Generators>,
     /// `K` of each group by itself; once it is eliminated, `D⁻¹`.
     within: Vec<[[f64; WIDEST]; WIDEST]>,
     /// `A` and its transpose, by rows, where limbs meet. As trees are walked depth first, there are few, which
@@ -267,42 +255,29 @@ impl SpatialRecursion {
         let joints = model.dynamics.joints.len();
         let (limbs, groups, places) = limbs(&model.dynamics);
         Self {
-            vertical: Vertical::new(model),
             within: vec![[[0.0; WIDEST]; WIDEST]; groups.len()],
             limbs,
             groups,
-            parts: vec![Parts::default(); joints],
-            axes: vec![Axis::default(); joints],
+            axes: vec![Generators::default(); joints],
             sums: vec![[[Block::ZERO; 8]; 2]; places],
             flows: vec![Block::ZERO; places],
         }
     }
 
-    /// Factors the matrix that belongs to the second derivatives of `mechanics`; all joints are dynamic,
+    /// Factors the matrix that belongs to the last second derivatives; all joints are dynamic,
     /// in the order of their coordinates. Each pivot is compared with the larger of its diagonal entry
     /// and the inertia of its row over the step. Of masses alone it is `−M/h`. About 600 flops an axis.
     #[inline(never)]
     pub(crate) fn factor(
         &mut self,
         model: &Model,
-        mechanics: &Mechanics,
+        curvature: &Curvature,
         added: Added<'_>,
         step: f64,
         kind: MatrixKind,
     ) -> SmallestPivot {
-        let step = Step::new(&self.vertical, step, kind);
-        self.write_parts(mechanics, &step);
-        in_eights(Factor { recursion: self, added, inertia: &model.conditioning.inertia, step })
-    }
-
-    /// From the last, with which the elimination begins, to the first.
-    #[inline(never)]
-    fn write_parts(&mut self, mechanics: &Mechanics, step: &Step) {
-        wide!({
-            for (joint, parts) in self.parts.iter_mut().enumerate() {
-                *parts = step.parts(mechanics, joint);
-            }
-        })
+        let (step, inertia) = (Step::new(step, kind), &model.conditioning.inertia[..]);
+        in_eights(Factor { recursion: self, curvature, added, inertia, step })
     }
 
     /// Solves `K x = b` in place, about 65 flops an axis.
@@ -315,6 +290,7 @@ impl SpatialRecursion {
 /// An elimination.
 struct Factor<'a> {
     recursion: &'a mut SpatialRecursion,
+    curvature: &'a Curvature,
     added: Added<'a>,
     inertia: &'a [f64],
     step: Step,
@@ -325,8 +301,8 @@ impl InEights for Factor<'_> {
 
     #[inline(always)]
     fn run<E: Eight>(self) -> SmallestPivot {
-        let Self { recursion, added, inertia, step } = self;
-        recursion.generate::<E>(added);
+        let Self { recursion, curvature, added, inertia, step } = self;
+        recursion.generate::<E>(curvature, &step, added);
         recursion.eliminate::<E>(|axis| inertia[axis] * step.inverse.abs())
     }
 }
@@ -334,21 +310,21 @@ impl InEights for Factor<'_> {
 impl SpatialRecursion {
     /// Writes the vectors of all axes, and `K` of each group.
     #[inline(always)]
-    fn generate<E: Eight>(&mut self, added: Added<'_>) {
+    fn generate<E: Eight>(&mut self, curvature: &Curvature, step: &Step, added: Added<'_>) {
         for (group, within) in self.groups.iter().zip(&mut self.within) {
-            let range = group.axes.clone();
-            let (parts, axes) = (&self.parts[range.clone()], &mut self.axes[range.clone()]);
-            if let (Some(ball), [p, q, r]) = (group.ball, parts) {
-                let parts = [Parts::<E>::of(p), Parts::<E>::of(q), Parts::<E>::of(r)];
+            let (range, first) = (group.axes.clone(), group.axes.start);
+            let axes = &mut self.axes[range.clone()];
+            if let Some(ball) = group.ball {
+                let parts = step.parts_of_ball::<E>(curvature, first);
                 let (generators, own) = of_ball(&parts, &added.balls[ball]);
                 for (axis, own) in axes.iter_mut().zip(generators) {
-                    axis.set(own);
+                    own.put(axis);
                 }
                 *within = own;
                 continue;
             }
-            for (axis, parts) in axes.iter_mut().zip(parts) {
-                axis.set(Parts::<E>::of(parts).generators());
+            for (i, axis) in range.clone().zip(&mut *axes) {
+                step.parts::<E>(curvature, i).generators().put(axis);
             }
             let diagonal = &added.diagonal[range];
             match *axes {
@@ -395,30 +371,19 @@ impl SpatialRecursion {
     }
 }
 
-impl Axis {
-    #[inline(always)]
-    fn set<E: Eight>(&mut self, generators: Generators<E>) {
-        let Generators { minus, plus, upper, lower } = generators;
-        minus.put(&mut self.minus);
-        plus.put(&mut self.plus);
-        upper.put(&mut self.u);
-        lower.put(&mut self.w_over_d);
-    }
-}
-
 /// `K` of hinges, slides and screws one below the other.
 #[inline(always)]
 fn write_within<E: Eight, const W: usize>(
-    axes: [&Axis; W],
+    axes: [&Generators; W],
     diagonal: &[f64],
     within: &mut [[f64; WIDEST]; WIDEST],
 ) {
     for (a, above) in axes.iter().enumerate() {
         let (minus, plus) = (E::of(&above.minus), E::of(&above.plus));
-        within[a][a] = minus.dot(E::of(&above.u)) + diagonal[a];
+        within[a][a] = minus.dot(E::of(&above.upper)) + diagonal[a];
         for (b, below) in axes.iter().enumerate().skip(a + 1) {
-            within[a][b] = minus.dot(E::of(&below.u));
-            within[b][a] = plus.dot(E::of(&below.w_over_d));
+            within[a][b] = minus.dot(E::of(&below.upper));
+            within[b][a] = plus.dot(E::of(&below.lower));
         }
     }
 }
@@ -426,7 +391,7 @@ fn write_within<E: Eight, const W: usize>(
 /// Eliminates the axes of a group; `see` takes an axis, its pivot, and what stands in `K` in its place.
 #[inline(always)]
 fn eliminate<E: Eight, const W: usize>(
-    axes: [&mut Axis; W],
+    axes: [&mut Generators; W],
     within: &mut [[f64; WIDEST]; WIDEST],
     sums: &mut Sums<E>,
     carries: bool,
@@ -437,8 +402,8 @@ fn eliminate<E: Eight, const W: usize>(
     let [mut u, mut w] = [[E::all(0.0); W]; 2];
     for a in 0..W {
         d[a].copy_from_slice(&within[a][..W]);
-        u[a] = E::of(&axes[a].u);
-        w[a] = E::of(&axes[a].w_over_d);
+        u[a] = E::of(&axes[a].upper);
+        w[a] = E::of(&axes[a].lower);
     }
     if carries {
         for b in 0..W {
@@ -460,8 +425,8 @@ fn eliminate<E: Eight, const W: usize>(
         for b in 1..W {
             w_over_d[a] = w_over_d[a].plus(w[b].scaled(inverse[a][b]));
         }
-        u[a].put(&mut axes[a].u);
-        w_over_d[a].put(&mut axes[a].w_over_d);
+        u[a].put(&mut axes[a].upper);
+        w_over_d[a].put(&mut axes[a].lower);
         within[a][..W].copy_from_slice(&inverse[a]);
     }
     if is_root {
@@ -469,10 +434,10 @@ fn eliminate<E: Eight, const W: usize>(
     }
     for a in 0..W {
         // Number by number from memory, where compilers would take the registers apart.
-        let axis: &Axis = black_box(&*axes[a]);
+        let axis: &Generators = black_box(&*axes[a]);
         for k in 0..8 {
-            sums.rows[k] = sums.rows[k].minus(w_over_d[a].scaled(axis.u.0[k]));
-            sums.columns[k] = sums.columns[k].minus(u[a].scaled(axis.w_over_d.0[k]));
+            sums.rows[k] = sums.rows[k].minus(w_over_d[a].scaled(axis.upper.0[k]));
+            sums.columns[k] = sums.columns[k].minus(u[a].scaled(axis.lower.0[k]));
         }
     }
 }
@@ -535,7 +500,7 @@ impl InEights for Solve<'_> {
 /// Eliminates the right-hand sides of a group: the flow above it, from the one below.
 #[inline(always)]
 fn lift<E: Eight, const W: usize>(
-    axes: [&Axis; W],
+    axes: [&Generators; W],
     x: [&mut f64; W],
     inverse: &[[f64; WIDEST]; WIDEST],
     flow: E,
@@ -551,17 +516,17 @@ fn lift<E: Eight, const W: usize>(
             value += inverse[a][c] * b[c];
         }
         *x[a] = value;
-        next = next.plus(E::of(&axes[a].u).scaled(value));
+        next = next.plus(E::of(&axes[a].upper).scaled(value));
     }
     next
 }
 
 /// The solution of a group and the flow below it, from the one above.
 #[inline(always)]
-fn lower<E: Eight, const W: usize>(axes: [&Axis; W], x: [&mut f64; W], flow: E) -> E {
+fn lower<E: Eight, const W: usize>(axes: [&Generators; W], x: [&mut f64; W], flow: E) -> E {
     let mut next = flow;
     for (x, axis) in x.into_iter().zip(axes) {
-        *x -= E::of(&axis.w_over_d).dot(flow);
+        *x -= E::of(&axis.lower).dot(flow);
         next = next.plus(E::of(&axis.plus).scaled(*x));
     }
     next

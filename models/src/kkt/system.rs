@@ -167,7 +167,8 @@ impl KktSystem {
                 (Recursion::Spatial(recursion), ..) => {
                     mechanics.differentiate(model);
                     let added = Added { diagonal, balls: &self.balls };
-                    recursion.factor(model, mechanics, added, time_step_s, kind)
+                    let curvature = &mechanics.curvature;
+                    recursion.factor(model, curvature, added, time_step_s, kind)
                 }
                 (Recursion::None | Recursion::Planar(_) | Recursion::Loops(_), ..) => {
                     return Ok(false);

@@ -5,24 +5,56 @@
 //! i above j:     ∂²L/∂v_i∂v_j = J_i·F_j      ∂²L/∂v_i∂q_j = J_i·P_j      ∂²L/∂q_i∂v_j = J̇_i·F_j
 //!                ∂²L/∂q_i∂q_j = J̇_i·P_j + w_i·(f_j × g)      w_i: angular part of J_i, f_j: force part of F_j
 //! ```
+//!
+//! With `e1`, `e2` and gravity `g = |g| e3` along three right-handed axes these are products of eight numbers:
+//!
+//! ```text
+//! axis = [J  0  0]      rate  = [J̇  w·e1  w·e2]
+//! force = [F  0  0]     slope = [P  |g| f·e2  −|g| f·e1]
+//! ```
 
-use plantd_math::scalar::{Compared, Scalar, in_registers};
-use plantd_math::spatial::{Force, Inertia, Mat3, Motion, Sym3, Vec3};
+use plantd_math::scalar::{Beside, Compared, LanesOf, Scalar, Truths, Wide};
+use plantd_math::spatial::{Inertia, Mat3, Sym3, Vec3};
 use plantd_math::tree_lu::TreeLu;
 
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
+use crate::lagrangian::sums::{Sums, firsts};
 use crate::model::mechanism::Pair;
-use crate::model::tree::{Rotational, Tree, WORLD};
+use crate::model::tree::{Rotational, Tree};
 
-/// Generators of the second derivatives.
+/// What the second derivatives are products of, a row for each joint.
 #[derive(Clone, Debug)]
-pub(crate) struct Curvature<S = f64> {
-    tensor: Vec<Sym3<S>>,
-    /// `F`.
-    pub(crate) force: Vec<Force<S>>,
-    /// `P`.
-    pub(crate) rate: Vec<Force<S>>,
+pub(crate) struct Curvature<S: Scalar = f64> {
+    vertical: Vertical,
+    /// Inertia of the subtrees about the origin.
+    tensors: Sums<S>,
+    pub(crate) axis: Vec<S::Row>,
+    pub(crate) rate: Vec<S::Row>,
+    pub(crate) force: Vec<S::Row>,
+    pub(crate) slope: Vec<S::Row>,
+    /// `½h rate ∓ axis`, for the Newton matrix.
+    flanks: Vec<[S::Row; 2]>,
+}
+
+/// Where gravity points.
+#[derive(Clone, Copy, Debug)]
+struct Vertical {
+    /// `e1` and `e2`.
+    horizontal: [Vec3; 2],
+    /// `|g|`.
+    gravity: f64,
+}
+
+impl Vertical {
+    fn new(gravity: Option<Vec3>) -> Self {
+        let size = gravity.map_or(0.0, Vec3::norm);
+        let [e1, e2, _] = match gravity {
+            Some(g) => Mat3::with_z_along(g * (1.0 / size)).0,
+            None => Mat3::ZERO.0,
+        };
+        Self { horizontal: [e1, e2], gravity: size }
+    }
 }
 
 /// Second derivatives of `L` for one pair of joints.
@@ -70,168 +102,200 @@ impl<S: Copy> SecondDerivatives<S> {
     }
 }
 
+/// What [`Curvature::evaluate`] does.
+struct Evaluate<'a, S: Scalar> {
+    curvature: &'a mut Curvature<S>,
+    tree: &'a Tree,
+    poses: &'a Poses<S>,
+    momenta: &'a Momenta<S>,
+}
+
+impl<S: Scalar> Beside<S> for Evaluate<'_, S> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<W: Wide<S>>(self) {
+        let Self { curvature, tree, poses, momenta } = self;
+        for i in firsts::<S>(tree) {
+            curvature.place::<W>(tree, poses, momenta, i);
+        }
+        curvature.tensors.ascend::<W, false>(tree);
+        for i in firsts::<S>(tree) {
+            let (axis, rate) = (momenta.axis.wide::<S, W>(i), momenta.axis_rate.wide::<S, W>(i));
+            let [xx, yy, zz, xy, xz, yz, ..] = curvature.tensors.take::<W>(i);
+            let composite = Inertia {
+                mass: tree.fixed::<S, W>(i).subtree_mass,
+                moment: momenta.moment.wide::<S, W>(i),
+                tensor: Sym3 { xx, yy, zz, xy, xz, yz },
+            };
+            let force = composite.momentum(axis);
+            let turned = axis.cross_force(momenta.momentum.wide::<S, W>(i));
+            let slope = turned.plus(composite.momentum(rate));
+            let Vertical { horizontal, gravity } = curvature.vertical;
+            let [e1, e2] = horizontal.map(Vec3::<W>::lift);
+            let tilt = [axis.w.dot(e1), axis.w.dot(e2)];
+            let weight = [force.f.dot(e2) * gravity, -force.f.dot(e1) * gravity];
+            let at = i..i + S::BESIDE;
+            W::spread(row(axis.w, axis.v, [W::ZERO; 2]), &mut curvature.axis[at.clone()]);
+            W::spread(row(rate.w, rate.v, tilt), &mut curvature.rate[at.clone()]);
+            W::spread(row(force.n, force.f, [W::ZERO; 2]), &mut curvature.force[at.clone()]);
+            W::spread(row(slope.n, slope.f, weight), &mut curvature.slope[at]);
+        }
+    }
+}
+
+#[inline(always)]
+fn row<W: Copy>(Vec3([a, b, c]): Vec3<W>, Vec3([d, e, f]): Vec3<W>, [g, h]: [W; 2]) -> [W; 8] {
+    [a, b, c, d, e, f, g, h]
+}
+
 impl<S: Scalar> Curvature<S> {
-    pub(crate) fn new(tree: &Tree) -> Self {
+    pub(crate) fn new(tree: &Tree, gravity: Option<Vec3>) -> Self {
         let n = tree.joints.len();
+        let rows = || vec![S::Row::default(); n.next_multiple_of(S::BESIDE)];
         Self {
-            tensor: vec![Sym3::default(); n],
-            force: vec![Force::default(); n],
-            rate: vec![Force::default(); n],
+            vertical: Vertical::new(gravity),
+            tensors: Sums::new(n),
+            axis: rows(),
+            rate: rows(),
+            force: rows(),
+            slope: rows(),
+            flanks: vec![Default::default(); n],
         }
     }
 
     /// Computes the generators from poses and momenta of the same configuration and velocity.
     #[inline(never)]
     pub(crate) fn evaluate(&mut self, tree: &Tree, poses: &Poses<S>, momenta: &Momenta<S>) {
-        in_registers!(S, {
-            let tensors = &mut self.tensor[..];
-            let (forces, rates) = (&mut self.force[..], &mut self.rate[..]);
-            for (i, joint) in tree.joints.iter().enumerate() {
-                let rotation = &poses.rotation[i];
-                let spin = match &joint.body.inertia {
-                    Rotational::None => {
-                        tensors[i] = Sym3::default();
-                        continue;
-                    }
-                    Rotational::Point => Sym3::default(),
-                    Rotational::Isotropic(i) => {
-                        Sym3::lift(Sym3 { xx: *i, yy: *i, zz: *i, ..Sym3::default() })
-                    }
-                    Rotational::Full(tensor) => Sym3::lift(*tensor).rotated(rotation),
-                };
-                let center = poses.position[i] + rotation.apply(Vec3::lift(joint.body.center));
-                tensors[i] = spin.add(&Sym3::of_point(joint.body.mass, center));
+        S::beside(tree.joints.len(), Evaluate { curvature: self, tree, poses, momenta });
+    }
+
+    /// Inertia about the origin of the bodies of the joints that begin with `i`.
+    #[inline(always)]
+    fn place<W: Wide<S>>(&mut self, tree: &Tree, poses: &Poses<S>, momenta: &Momenta<S>, i: usize) {
+        let rotational = tree.rotational::<S>(i);
+        if let Rotational::None = rotational {
+            self.tensors.put(i, [W::ZERO; 8]);
+            return;
+        }
+        let fixed = tree.fixed::<S, W>(i);
+        let mut tensor = Sym3::of_point(fixed.mass, momenta.center.wide::<S, W>(i));
+        match rotational {
+            Rotational::None | Rotational::Point => {}
+            Rotational::Isotropic(_) => tensor = fixed.inertia.add(&tensor),
+            Rotational::Full(_) => {
+                let rotation = poses.wide::<W>(i).rotation();
+                tensor = fixed.inertia.rotated(&rotation).add(&tensor);
             }
-            for (i, joint) in tree.joints.iter().enumerate().rev() {
-                if joint.parent != WORLD {
-                    tensors[joint.parent] = tensors[joint.parent].add(&tensors[i]);
-                }
-                let composite = Inertia {
-                    mass: joint.subtree_mass,
-                    moment: momenta.moment[i],
-                    tensor: tensors[i],
-                };
-                let axis = momenta.axis[i];
-                forces[i] = composite.momentum(axis);
-                rates[i] = axis
-                    .cross_force(momenta.momentum[i])
-                    .plus(composite.momentum(momenta.axis_rate[i]));
-            }
-        })
+        }
+        let Sym3 { xx, yy, zz, xy, xz, yz } = tensor;
+        self.tensors.put(i, [xx, yy, zz, xy, xz, yz, W::ZERO, W::ZERO]);
     }
 
     /// Second derivatives of a pair of joints on one path to the root.
     #[inline(always)]
-    pub(crate) fn pair(
-        &self,
-        momenta: &Momenta<S>,
-        gravity: Option<Vec3>,
-        ancestor: usize,
-        descendant: usize,
-    ) -> SecondDerivatives<S> {
-        let (axis, axis_rate) = (momenta.axis[ancestor], momenta.axis_rate[ancestor]);
-        let (force, rate) = (self.force[descendant], self.rate[descendant]);
-        let weight = gravity.map_or(S::ZERO, |g| axis.w.dot(force.f.cross(Vec3::lift(g))));
+    pub(crate) fn pair(&self, ancestor: usize, descendant: usize) -> SecondDerivatives<S> {
+        let (axis, rate) = (&self.axis[ancestor], &self.rate[ancestor]);
+        let (force, slope) = (&self.force[descendant], &self.slope[descendant]);
         SecondDerivatives {
-            qq: axis_rate.dot(rate) + weight,
-            v_above_q_below: axis.dot(rate),
-            q_above_v_below: axis_rate.dot(force),
-            vv: self.inertia_between(momenta, ancestor, descendant),
+            qq: S::dot(rate, slope),
+            v_above_q_below: S::dot_of_six(axis, slope),
+            q_above_v_below: S::dot_of_six(rate, force),
+            vv: S::dot_of_six(axis, force),
         }
-    }
-
-    /// The entry of the mass matrix `L_vv` for a pair of joints on one path to the root.
-    #[inline(always)]
-    fn inertia_between(&self, momenta: &Momenta<S>, ancestor: usize, descendant: usize) -> S {
-        momenta.axis[ancestor].dot(self.force[descendant])
     }
 
     /// Derivatives between the axes of one ball joint, the first of which is `first`. They turn with the
     /// joint: what [`Curvature::pair`] says holds for different joints only.
     #[inline(always)]
-    pub(crate) fn within_ball(
-        &self,
-        momenta: &Momenta<S>,
-        gravity: Option<Vec3>,
-        first: usize,
-    ) -> Within<S> {
+    pub(crate) fn within_ball(&self, first: usize) -> Within<S> {
         let axes = [first, first + 1, first + 2];
         let [mut tau_z, mut tau_v, mut m_v] = [Mat3::ZERO; 3];
         for (a, &row) in axes.iter().enumerate() {
-            let (rate, slope, force) = (momenta.axis_rate[row], self.rate[row], self.force[row]);
-            let weight = gravity.map_or(Vec3::ZERO, |g| force.f.cross(Vec3::lift(g)));
             for (b, &column) in axes.iter().enumerate() {
-                let axis = momenta.axis[column];
-                tau_z.0[b].0[a] = momenta.axis_rate[column].dot(slope) + axis.w.dot(weight);
-                tau_v.0[b].0[a] = rate.dot(self.force[column]);
-                m_v.0[b].0[a] = axis.dot(force);
+                tau_z.0[b].0[a] = S::dot(&self.rate[column], &self.slope[row]);
+                tau_v.0[b].0[a] = S::dot_of_six(&self.rate[row], &self.force[column]);
+                m_v.0[b].0[a] = S::dot_of_six(&self.axis[column], &self.force[row]);
             }
         }
         Within { tau_z, tau_v, m_v }
     }
 }
 
-impl<S: Compared> Curvature<S> {
-    /// Takes the generators of others where that is said.
+impl<const N: usize> Curvature<LanesOf<N>> {
+    /// Takes the rows of others where that is said.
     #[inline(always)]
-    pub(crate) fn take_where(&mut self, truth: S::Truth, others: &Self) {
-        let choose = |own: &mut Force<S>, other: &Force<S>| {
-            for (own, other) in [(&mut own.n, &other.n), (&mut own.f, &other.f)] {
-                for (own, other) in own.0.iter_mut().zip(&other.0) {
-                    *own = S::choose(truth, *other, *own);
-                }
+    pub(crate) fn take_where(&mut self, truth: Truths<N>, others: &Self) {
+        let Self { axis, rate, force, slope, .. } = others;
+        for (own, other) in [&mut self.axis, &mut self.rate, &mut self.force, &mut self.slope]
+            .into_iter()
+            .zip([axis, rate, force, slope])
+        {
+            for (own, other) in own.as_flattened_mut().iter_mut().zip(other.as_flattened()) {
+                *own = LanesOf::choose(truth, *other, *own);
             }
-        };
-        self.force.iter_mut().zip(&others.force).for_each(|(own, other)| choose(own, other));
-        self.rate.iter_mut().zip(&others.rate).for_each(|(own, other)| choose(own, other));
+        }
     }
+}
 
+impl<S: Compared> Curvature<S> {
     /// Writes the Jacobian of the residual by the increment, without springs and forces:
     /// `K = ¼h L_qq + ½ L_qv − ½ L_vq − L_vv/h`.
     ///
-    /// Both entries of a pair come from `½h J̇ ∓ J` of the ancestor and `½P ± F/h` of the descendant.
+    /// Both entries of a pair come from `½h rate ∓ axis` of the ancestor and `½ slope ± force/h` of the
+    /// descendant.
     #[inline(never)]
-    pub(crate) fn fill_newton_matrix(
-        &self,
-        pairs: &[Pair],
-        momenta: &Momenta<S>,
-        gravity: Option<Vec3>,
-        step: f64,
-        matrix: &mut TreeLu<S>,
-    ) {
-        in_registers!(S, {
-            let [half, middle, inverse, same, back] =
-                [0.5 * step, 0.5, 1.0 / step, 1.0, -1.0].map(S::constant);
-            let (mut plus, mut minus) = (Force::default(), Force::default());
-            let mut weight = Vec3::ZERO;
-            for pair in pairs.iter().rev() {
-                let (i, j) = (pair.ancestor as usize, pair.descendant as usize);
-                if i == j {
-                    // Pairs come grouped by descendant, and backwards the descendant itself comes first.
-                    let (f, p) = (self.force[j], self.rate[j]);
-                    plus = Force::default().add_scaled(middle, p).add_scaled(inverse, f);
-                    minus = Force::default().add_scaled(middle, p).add_scaled(-inverse, f);
-                    weight = gravity
-                        .map_or(Vec3::ZERO, |g| f.f.cross(Vec3::lift(g)).scaled(0.25 * step));
-                }
-                let (axis, axis_rate) = (momenta.axis[i], momenta.axis_rate[i]);
-                let gravity_term = axis.w.dot(weight);
-                let scaled = Motion { w: axis_rate.w * half, v: axis_rate.v * half };
-                matrix.upper[pair.slot as usize] =
-                    scaled.add_scaled(back, axis).dot(plus) + gravity_term;
-                matrix.lower[pair.slot as usize] =
-                    scaled.add_scaled(same, axis).dot(minus) + gravity_term;
+    pub(crate) fn fill_newton_matrix(&mut self, pairs: &[Pair], step: f64, matrix: &mut TreeLu<S>) {
+        S::beside(self.flanks.len(), Fill { curvature: self, pairs, step, matrix });
+    }
+}
+
+/// What [`Curvature::fill_newton_matrix`] does.
+struct Fill<'a, S: Scalar> {
+    curvature: &'a mut Curvature<S>,
+    pairs: &'a [Pair],
+    step: f64,
+    matrix: &'a mut TreeLu<S>,
+}
+
+impl<S: Compared> Beside<S> for Fill<'_, S> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<W: Wide<S>>(self) {
+        let Self { curvature: Curvature { axis, rate, force, slope, flanks, .. }, .. } = self;
+        let [half, middle, inverse, minus_one] =
+            [0.5 * self.step, 0.5, 1.0 / self.step, -1.0].map(S::constant);
+        for (i, [minus, plus]) in flanks.iter_mut().enumerate() {
+            let (axis, rate) = (W::row(&axis[i]), W::scaled(W::row(&rate[i]), half));
+            W::put_row(W::sum(rate, W::scaled(axis, minus_one)), minus);
+            W::put_row(W::sum(rate, axis), plus);
+        }
+        let Some(last) = flanks.len().checked_sub(1) else { return };
+        let mut upper = W::row(&force[last]);
+        let mut lower = upper;
+        for pair in self.pairs.iter().rev() {
+            let (i, j) = (pair.ancestor as usize, pair.descendant as usize);
+            if i == j {
+                // Pairs come grouped by descendant, and backwards the descendant itself comes first.
+                let force = W::scaled(W::row(&force[j]), inverse);
+                let slope = W::scaled(W::row(&slope[j]), middle);
+                upper = W::sum(slope, force);
+                lower = W::sum(slope, W::scaled(force, minus_one));
             }
-        })
+            let [minus, plus] = &flanks[i];
+            self.matrix.upper[pair.slot as usize] = W::dot_of(W::row(minus), upper);
+            self.matrix.lower[pair.slot as usize] = W::dot_of(W::row(plus), lower);
+        }
     }
 }
 
 impl Curvature {
     /// Writes the mass matrix `L_vv` of the dynamic coordinates.
-    pub(crate) fn fill_mass_matrix(&self, pairs: &[Pair], momenta: &Momenta, matrix: &mut TreeLu) {
+    pub(crate) fn fill_mass_matrix(&self, pairs: &[Pair], matrix: &mut TreeLu) {
         for pair in pairs {
             let (ancestor, descendant) = (pair.ancestor as usize, pair.descendant as usize);
-            let entry = self.inertia_between(momenta, ancestor, descendant);
+            let entry = f64::dot(&self.axis[ancestor], &self.force[descendant]);
             matrix.upper[pair.slot as usize] = entry;
             matrix.lower[pair.slot as usize] = entry;
         }

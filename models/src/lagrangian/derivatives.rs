@@ -35,7 +35,7 @@ use crate::model::tree::{JointKind, WORLD};
 ///
 /// Matrices are row-major.
 #[derive(Clone, Debug)]
-pub(crate) struct Derivatives<S = f64> {
+pub(crate) struct Derivatives<S: Scalar = f64> {
     pub(crate) poses: Poses<S>,
     pub(crate) momenta: Momenta<S>,
     curvature: Curvature<S>,
@@ -86,7 +86,7 @@ impl<S: Scalar> Derivatives<S> {
             balls: (0..joints.len()).filter(is_first).collect(),
             poses: Poses::new(&model.dynamics),
             momenta: Momenta::new(&model.dynamics),
-            curvature: Curvature::new(&model.dynamics),
+            curvature: Curvature::new(&model.dynamics, model.gravity),
             l_q: zeros(nd),
             l_v: zeros(nd),
             force: zeros(nd),
@@ -154,14 +154,14 @@ impl<S: Scalar> Derivatives<S> {
         // Where no pair of joints has an entry.
         model.armature.iter().for_each(|a| self.l_vv[a.row * n + a.column] = S::ZERO);
         for &[above, below, i, j] in &self.pairs {
-            let second = self.curvature.pair(&self.momenta, model.gravity, above, below);
+            let second = self.curvature.pair(above, below);
             for (row, column, entry) in second.entries(i, j) {
                 let at = row * n + column;
                 (self.l_qq[at], self.l_qv[at], self.l_vv[at]) = (entry.qq, entry.qv, entry.vv);
             }
         }
         for &first in &self.balls {
-            let within = self.curvature.within_ball(&self.momenta, model.gravity, first);
+            let within = self.curvature.within_ball(first);
             let i = model.dynamics.joints[first].coordinate;
             for (a, b) in (0..9).map(|entry| (entry / 3, entry % 3)) {
                 self.l_qq[(i + a) * n + i + b] = within.tau_z.0[b][a];

@@ -42,7 +42,7 @@ pub(crate) fn add_damping<S: Scalar>(
 
 /// Where and how fast a mechanism is, and its inputs: what forces depend on.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Instant<'a, S = f64> {
+pub(crate) struct Instant<'a, S: Scalar = f64> {
     pub(crate) tree: &'a Tree,
     pub(crate) poses: &'a Poses<S>,
     /// With axes and twists of the same configuration and velocity.

@@ -1,18 +1,14 @@
 //! The second derivatives of the Lagrangian in a step, as products of vectors of eight numbers.
 //!
-//! With `e1`, `e2` and gravity `g = |g| e3` along three right-handed axes, and for joint `i` on the path from
-//! `j` to the root (or `i = j`), all about the origin of the tree, the Newton matrix is
+//! For joint `i` on the path from `j` to the root (or `i = j`) the Newton matrix is, with the rows of
+//! [`curvature`](crate::lagrangian::curvature),
 //!
 //! ```text
-//! K_ij = minus_i · upper_j      minus = rate − axis      upper = slope + force
-//! K_ji = plus_i · lower_j       plus  = rate + axis      lower = slope − force
-//!
-//! axis = [J  0  0]      rate  = [½h J̇  w·e1  w·e2]      force = [F/h  0  0]
-//!                       slope = [½P  ¼h |g| f·e2  −¼h |g| f·e1]
+//! K_ij = minus_i · upper_j      minus = ½h rate − axis      upper = ½ slope + force/h
+//! K_ji = plus_i · lower_j       plus  = ½h rate + axis      lower = ½ slope − force/h
 //! ```
 //!
-//! with the angular part `w` of `J` and the force part `f` of `F`: eight numbers, as what turns about the
-//! vertical changes nothing of a weight.
+//! In what follows `rate`, `slope` and `force` are these multiples.
 //!
 //! A ball joint has three of each, of its axes. With the maps of [`turning`](crate::lagrangian::turning)
 //! and `C = dexp₋ξ/2`, by which its midpoint turns twice as far as `ξ` changes,
@@ -46,11 +42,10 @@
 
 use plantd_math::eights::Eight;
 use plantd_math::rows::Block;
-use plantd_math::spatial::{Mat3, Vec3};
+use plantd_math::spatial::Mat3;
 
-use crate::lagrangian::mechanics::Mechanics;
+use crate::lagrangian::curvature::Curvature;
 use crate::lagrangian::turning::{Turning, Weights};
-use crate::model::mechanism::Model;
 
 /// Which matrix of the second derivatives of the Lagrangian.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -64,16 +59,12 @@ pub(crate) enum MatrixKind {
 /// What the generators of all joints of a step have in common.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Step {
-    /// `e1` and `e2`.
-    horizontal: [Vec3; 2],
     /// ½, or 0 for masses alone.
     motion: f64,
     /// `½h`, or 0.
     half: f64,
     /// `1/h`.
     pub(crate) inverse: f64,
-    /// `¼h |g|`, or 0.
-    weight: f64,
 }
 
 /// What the generators of a joint are made of.
@@ -92,11 +83,6 @@ pub(crate) struct Generators<E = Block> {
     pub(crate) plus: E,
     pub(crate) upper: E,
     pub(crate) lower: E,
-}
-
-#[inline(always)]
-fn lanes(a: Vec3, b: Vec3, [c, d]: [f64; 2]) -> Block {
-    Block([a[0], a[1], a[2], b[0], b[1], b[2], c, d])
 }
 
 #[inline(always)]
@@ -128,47 +114,40 @@ pub(crate) fn columns<E: Eight>(m: &Mat3, vectors: &[E; 3]) -> [E; 3] {
 impl Step {
     /// Of the length `h`.
     #[inline(always)]
-    pub(crate) fn new(vertical: &Vertical, h: f64, kind: MatrixKind) -> Self {
+    pub(crate) fn new(h: f64, kind: MatrixKind) -> Self {
         let motion = if kind == MatrixKind::Mass { 0.0 } else { 0.5 };
-        let half = h * motion;
-        let weight = 0.5 * half * vertical.gravity;
-        Self { horizontal: vertical.horizontal, motion, half, inverse: 1.0 / h, weight }
+        Self { motion, half: h * motion, inverse: 1.0 / h }
+    }
+
+    /// The parts of a joint, at the last second derivatives.
+    #[inline(always)]
+    pub(crate) fn parts<E: Eight>(&self, curvature: &Curvature, joint: usize) -> Parts<E> {
+        let Self { motion, half, inverse } = *self;
+        let Curvature { axis, rate, force, slope, .. } = curvature;
+        Parts {
+            axis: E::of(&axis[joint]),
+            rate: E::of(&rate[joint]).scaled(half),
+            force: E::of(&force[joint]).scaled(inverse),
+            slope: E::of(&slope[joint]).scaled(motion),
+        }
     }
 
     /// The parts of the axes of a ball joint.
     #[inline(always)]
-    pub(crate) fn parts_of_ball(&self, mechanics: &Mechanics, first: usize) -> [Parts; 3] {
-        let of = |a: usize| self.parts(mechanics, first + a);
-        [of(0), of(1), of(2)]
-    }
-
-    /// The parts of a joint, at the second derivatives of `mechanics`.
-    #[inline(always)]
-    pub(crate) fn parts(&self, mechanics: &Mechanics, joint: usize) -> Parts {
-        let Self { horizontal: [e1, e2], motion, half, inverse, weight } = *self;
-        let Mechanics { momenta, curvature, .. } = mechanics;
-        let (axis, rate) = (momenta.axis[joint], momenta.axis_rate[joint]);
-        let (force, slope) = (curvature.force[joint], curvature.rate[joint]);
-        let tilt = [axis.w.dot(e1), axis.w.dot(e2)];
-        let weight = [weight * force.f.dot(e2), -weight * force.f.dot(e1)];
-        Parts {
-            axis: lanes(axis.w, axis.v, [0.0; 2]),
-            rate: lanes(rate.w * half, rate.v * half, tilt),
-            force: lanes(force.n * inverse, force.f * inverse, [0.0; 2]),
-            slope: lanes(slope.n * motion, slope.f * motion, weight),
-        }
+    pub(crate) fn parts_of_ball<E: Eight>(
+        &self,
+        curvature: &Curvature,
+        first: usize,
+    ) -> [Parts<E>; 3] {
+        [
+            self.parts(curvature, first),
+            self.parts(curvature, first + 1),
+            self.parts(curvature, first + 2),
+        ]
     }
 }
 
 impl<E: Eight> Parts<E> {
-    #[inline(always)]
-    pub(crate) fn of(parts: &Parts) -> Self {
-        let Parts { axis, rate, force, slope } = parts;
-        let [axis, rate] = [E::of(axis), E::of(rate)];
-        let [force, slope] = [E::of(force), E::of(slope)];
-        Self { axis, rate, force, slope }
-    }
-
     /// Of a hinge, a slide or a screw.
     #[inline(always)]
     pub(crate) fn generators(&self) -> Generators<E> {
@@ -179,6 +158,17 @@ impl<E: Eight> Parts<E> {
             upper: slope.plus(force),
             lower: slope.minus(force),
         }
+    }
+}
+
+impl<E: Eight> Generators<E> {
+    /// To memory.
+    #[inline(always)]
+    pub(crate) fn put(&self, to: &mut Generators) {
+        self.minus.put(&mut to.minus);
+        self.plus.put(&mut to.plus);
+        self.upper.put(&mut to.upper);
+        self.lower.put(&mut to.lower);
     }
 }
 
@@ -217,22 +207,22 @@ pub(crate) fn of_ball<E: Eight>(
 
 /// What a joint gives to the linearization of a step.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Flanks {
-    pub(crate) parts: Parts,
+pub(crate) struct Flanks<E = Block> {
+    pub(crate) parts: Parts<E>,
     /// Of a ball joint: its rows and columns are weighed.
     pub(crate) is_turned: bool,
-    pub(crate) newton: Generators,
+    pub(crate) newton: Generators<E>,
     /// Rows of the momentum, of a joint with others below it, and below others.
-    pub(crate) carry: Block,
-    pub(crate) push: Block,
+    pub(crate) carry: E,
+    pub(crate) push: E,
     /// Columns of the start.
-    pub(crate) above: Block,
-    pub(crate) below: Block,
+    pub(crate) above: E,
+    pub(crate) below: E,
 }
 
-impl Flanks {
+impl<E: Eight> Flanks<E> {
     #[inline(always)]
-    pub(crate) fn of(parts: &Parts) -> Self {
+    pub(crate) fn of(parts: &Parts<E>) -> Self {
         let Parts { rate, slope, .. } = parts;
         let [rate, slope] = [rate.scaled(2.0), slope.scaled(2.0)];
         let newton = parts.generators();
@@ -241,45 +231,41 @@ impl Flanks {
     }
 
     #[inline(always)]
-    pub(crate) fn of_ball(parts: &[Parts; 3], turning: &Turning, weights: &Weights) -> [Self; 3] {
+    pub(crate) fn of_ball(
+        parts: &[Parts<E>; 3],
+        turning: &Turning,
+        weights: &Weights,
+    ) -> [Self; 3] {
         let (newton, _) = of_ball(parts, weights);
         let [p, q, r] = parts;
-        let twice = |of: fn(&Parts) -> Block| [of(p), of(q), of(r)].map(|part| part.scaled(2.0));
-        let [rate, slope] = [twice(|part| part.rate), twice(|part| part.slope)];
-        let spin = turning.spin();
+        let mut flanks = [Self::of(p), Self::of(q), Self::of(r)];
+        let [a, b, c] = &flanks;
+        let (rate, slope) = ([a.carry, b.carry, c.carry], [a.push, b.push, c.push]);
+        let (spin, start) = (turning.spin(), &turning.by_start.0);
         let axes = rows(&spin, &[p.axis, q.axis, r.axis]);
         let forces = rows(&spin, &[p.force, q.force, r.force]);
-        let start = &turning.by_start.0;
         let (above, below) = (columns(start, &rate), columns(start, &slope));
-        let of = |a: usize| Self {
-            parts: parts[a],
-            is_turned: true,
-            newton: newton[a],
-            carry: rate[a].plus(axes[a]),
-            push: slope[a].plus(forces[a]),
-            above: above[a],
-            below: below[a],
-        };
-        [of(0), of(1), of(2)]
+        for (a, own) in flanks.iter_mut().enumerate() {
+            (own.is_turned, own.newton) = (true, newton[a]);
+            (own.carry, own.push) = (rate[a].plus(axes[a]), slope[a].plus(forces[a]));
+            (own.above, own.below) = (above[a], below[a]);
+        }
+        flanks
     }
-}
 
-/// Where gravity points.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Vertical {
-    /// `e1` and `e2`.
-    horizontal: [Vec3; 2],
-    /// `|g|`.
-    gravity: f64,
-}
-
-impl Vertical {
-    pub(crate) fn new(model: &Model) -> Self {
-        let size = model.gravity.map_or(0.0, Vec3::norm);
-        let [e1, e2, _] = match model.gravity {
-            Some(g) => Mat3::with_z_along(g * (1.0 / size)).0,
-            None => Mat3::ZERO.0,
-        };
-        Self { horizontal: [e1, e2], gravity: size }
+    /// To memory.
+    #[inline(always)]
+    pub(crate) fn put(&self, to: &mut Flanks) {
+        to.is_turned = self.is_turned;
+        self.newton.put(&mut to.newton);
+        let Parts { axis, rate, force, slope } = &mut to.parts;
+        self.parts.axis.put(axis);
+        self.parts.rate.put(rate);
+        self.parts.force.put(force);
+        self.parts.slope.put(slope);
+        self.carry.put(&mut to.carry);
+        self.push.put(&mut to.push);
+        self.above.put(&mut to.above);
+        self.below.put(&mut to.below);
     }
 }

@@ -1,17 +1,20 @@
 //! Poses of the joints at a configuration.
 
-use plantd_math::scalar::{Scalar, in_registers};
-use plantd_math::spatial::{Mat3, Vec3};
+use plantd_math::scalar::{Beside, Scalar, Wide};
+use plantd_math::sided::{Composite, Sided};
+use plantd_math::spatial::{Mat3, Pose, Vec3};
 
 use crate::model::tree::{Attachment, JointKind, Tree, WORLD};
 
 /// Poses of the joints of a tree, each position measured from the origin of its own tree.
 #[derive(Clone, Debug)]
-pub(crate) struct Poses<S = f64> {
+pub(crate) struct Poses<S: Scalar = f64> {
     pub(crate) rotation: Vec<Mat3<S>>,
     pub(crate) position: Vec<Vec3<S>>,
     /// World position of the origin of the tree rooted at a joint; meaningful for roots.
     pub(crate) origin: Vec<Vec3<S>>,
+    /// Rotations and positions, where those of several joints lie side by side.
+    sides: Sided<Pose<S::Several>>,
     /// Position of a joint relative to its parent.
     edge: Vec<Vec3<S>>,
     /// Angles by which hinges and screws turn about their axes, in their order, and their sines and cosines.
@@ -21,11 +24,54 @@ pub(crate) struct Poses<S = f64> {
 
 /// A configuration, as far as potentials and constraints depend on it.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Place<'a, S = f64> {
+pub(crate) struct Place<'a, S: Scalar = f64> {
     pub(crate) tree: &'a Tree,
     pub(crate) poses: &'a Poses<S>,
     /// All coordinates.
     pub(crate) q: &'a [S],
+}
+
+/// What [`Poses::evaluate`] does.
+struct Walk<'a, S: Scalar> {
+    poses: &'a mut Poses<S>,
+    tree: &'a Tree,
+    q: &'a [S],
+    orientations: &'a [Mat3<S>],
+}
+
+impl<S: Scalar> Beside<S> for Walk<'_, S> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<W: Wide<S>>(self) {
+        let Self { poses, tree, q, orientations } = self;
+        if tree.has_other_joints {
+            poses.walk::<W, true>(tree, q, orientations);
+        } else {
+            poses.walk::<W, false>(tree, q, orientations);
+        }
+    }
+}
+
+/// A matrix in registers.
+#[inline(always)]
+fn columns<S: Scalar, W: Wide<S>>(matrix: &Mat3<S>) -> [W::Triple; 3] {
+    let Mat3([x, y, z]) = matrix;
+    [W::triple(&x.0), W::triple(&y.0), W::triple(&z.0)]
+}
+
+/// A matrix times a vector that does not change.
+#[inline(always)]
+fn fixed<S: Scalar, W: Wide<S>>([x, y, z]: &[W::Triple; 3], v: &Vec3) -> W::Triple {
+    let sum = W::triple_sum(W::triple_times(*x, v[0]), W::triple_times(*y, v[1]));
+    W::triple_sum(sum, W::triple_times(*z, v[2]))
+}
+
+/// A matrix times a vector.
+#[inline(always)]
+fn moving<S: Scalar, W: Wide<S>>([x, y, z]: &[W::Triple; 3], v: &Vec3<S>) -> W::Triple {
+    let sum = W::triple_sum(W::triple_scaled(*x, v[0]), W::triple_scaled(*y, v[1]));
+    W::triple_sum(sum, W::triple_scaled(*z, v[2]))
 }
 
 impl<S: Scalar> Poses<S> {
@@ -36,6 +82,7 @@ impl<S: Scalar> Poses<S> {
             rotation: vec![Mat3::IDENTITY; n],
             position: vec![Vec3::ZERO; n],
             origin: vec![Vec3::ZERO; n],
+            sides: Sided::zeros::<S>(if S::BESIDE > 1 { n } else { 0 }),
             edge: vec![Vec3::ZERO; n],
             angles: vec![S::ZERO; turns],
             turns: vec![[S::ZERO, S::ONE]; turns],
@@ -61,74 +108,120 @@ impl<S: Scalar> Poses<S> {
         self.rotation[joint].0[2]
     }
 
+    /// Poses of the joints that begin with `i`.
+    #[inline(always)]
+    pub(crate) fn wide<W: Wide<S>>(&self, i: usize) -> Pose<W> {
+        if S::BESIDE > 1 { self.sides.wide::<S, W>(i) } else { self.pose(i).map(W::of_one) }
+    }
+
+    #[inline(always)]
+    fn pose(&self, joint: usize) -> Pose<S> {
+        let Mat3([x, y, z]) = self.rotation[joint];
+        Pose { x, y, z, at: self.position[joint] }
+    }
+
     /// Poses at the configuration `q`, with the orientations of ball joints: one pass from the roots
     /// to the leaves, about 50 flops and one sine and cosine for each joint.
     #[inline(never)]
     pub(crate) fn evaluate(&mut self, tree: &Tree, q: &[S], orientations: &[Mat3<S>]) {
-        in_registers!(S, {
-            if tree.has_other_joints {
-                self.walk::<true>(tree, q, orientations);
-            } else {
-                self.walk::<false>(tree, q, orientations);
-            }
-        })
+        S::beside(tree.joints.len(), Walk { poses: self, tree, q, orientations });
     }
 
     /// `OTHER`: some joint is neither revolute nor prismatic.
     #[inline(always)]
-    fn walk<const OTHER: bool>(&mut self, tree: &Tree, q: &[S], orientations: &[Mat3<S>]) {
+    fn walk<W: Wide<S>, const OTHER: bool>(
+        &mut self,
+        tree: &Tree,
+        q: &[S],
+        orientations: &[Mat3<S>],
+    ) {
         let hinges = tree.joints.iter().filter(|joint| joint.kind.turns_about_axis());
         for (angle, hinge) in self.angles.iter_mut().zip(hinges) {
             *angle = q[hinge.coordinate];
         }
         S::sin_cos_of_all(&self.angles, &mut self.turns);
         let mut hinges_before = 0;
+        let zero = W::triple(&[S::ZERO; 3]);
+        let world = columns::<S, W>(&Mat3::IDENTITY);
+        // The pose of the joint before stays in registers.
+        let (mut last, mut last_position) = (world, zero);
         for (i, joint) in tree.joints.iter().enumerate() {
             if let (true, JointKind::Ball(1 | 2)) = (OTHER, joint.kind) {
                 // The entry before has turned already.
-                let Mat3([x, y, z]) = self.rotation[i - 1];
-                self.rotation[i] = Mat3([y, z, x]);
-                self.position[i] = self.position[i - 1];
-                if joint.anchor {
-                    self.move_origin(tree, i);
-                }
+                let [x, y, z] = last;
+                last = [y, z, x];
+                last_position = self.set_aside::<W>(tree, i, last, last_position);
                 continue;
             }
-            // In the parent's frame, which nothing waits for.
-            let own = if joint.kind.turns_about_axis() {
-                let turn = self.turns[hinges_before];
-                hinges_before += 1;
-                turned_about_z(&joint.rotation, turn)
-            } else {
-                Mat3::lift(joint.rotation)
-            };
-            let (turned, mut edge) = if joint.parent == WORLD {
-                self.origin[i] = Vec3::lift(joint.translation);
-                (own, Vec3::ZERO)
-            } else {
-                let parent = &self.rotation[joint.parent];
-                (parent.times(&own), parent.apply(Vec3::lift(joint.translation)))
-            };
-            let z = turned.0[2];
-            self.rotation[i] = match joint.kind {
-                JointKind::Ball(0) if OTHER => {
-                    let Mat3([x, y, z]) = turned.times(&orientations[joint.orientation]);
-                    Mat3([y, z, x])
+            let (parent, position) = match joint.parent {
+                WORLD => (world, zero),
+                parent if parent + 1 == i => (last, last_position),
+                parent => {
+                    (columns::<S, W>(&self.rotation[parent]), W::triple(&self.position[parent].0))
                 }
-                _ => turned,
             };
+            let Mat3([x, y, z]) = &joint.rotation;
+            let [mut x, mut y, z] =
+                [fixed::<S, W>(&parent, x), fixed::<S, W>(&parent, y), fixed::<S, W>(&parent, z)];
+            if joint.kind.turns_about_axis() {
+                let [s, c] = self.turns[hinges_before];
+                hinges_before += 1;
+                let turned = W::triple_sum(W::triple_scaled(x, c), W::triple_scaled(y, s));
+                y = W::triple_sum(W::triple_scaled(y, c), W::triple_scaled(x, -s));
+                x = turned;
+            }
+            let mut edge = zero;
+            if joint.parent == WORLD {
+                self.origin[i] = Vec3::lift(joint.translation);
+            } else {
+                edge = fixed::<S, W>(&parent, &joint.translation);
+            }
+            last = [x, y, z];
             match joint.kind {
-                JointKind::Prismatic => edge += z * q[joint.coordinate],
-                JointKind::Screw(pitch) if OTHER => edge += z * (q[joint.coordinate] * pitch),
+                JointKind::Prismatic => {
+                    edge = W::triple_sum(edge, W::triple_scaled(z, q[joint.coordinate]));
+                }
+                JointKind::Screw(pitch) if OTHER => {
+                    let slide = W::triple_scaled(z, q[joint.coordinate] * pitch);
+                    edge = W::triple_sum(edge, slide);
+                }
+                JointKind::Ball(0) if OTHER => {
+                    let Mat3([x, y, z]) = &orientations[joint.orientation];
+                    last = [
+                        moving::<S, W>(&last, y),
+                        moving::<S, W>(&last, z),
+                        moving::<S, W>(&last, x),
+                    ];
+                }
                 _ => {}
             }
-            self.edge[i] = edge;
-            self.position[i] =
-                if joint.parent == WORLD { edge } else { self.position[joint.parent] + edge };
-            if joint.anchor {
-                self.move_origin(tree, i);
-            }
+            W::put_triple(edge, &mut self.edge[i].0);
+            let position = W::triple_sum(position, edge);
+            last_position = self.set_aside::<W>(tree, i, last, position);
         }
+    }
+
+    /// Takes note of the pose of a joint; returns its position, from the origin that counts from now on.
+    #[inline(always)]
+    fn set_aside<W: Wide<S>>(
+        &mut self,
+        tree: &Tree,
+        joint: usize,
+        rotation: [W::Triple; 3],
+        mut position: W::Triple,
+    ) -> W::Triple {
+        for (column, to) in rotation.into_iter().zip(&mut self.rotation[joint].0) {
+            W::put_triple(column, &mut to.0);
+        }
+        W::put_triple(position, &mut self.position[joint].0);
+        if tree.joints[joint].anchor {
+            self.move_origin(tree, joint);
+            position = W::triple(&[S::ZERO; 3]);
+        }
+        if S::BESIDE > 1 {
+            self.sides.put::<S>(joint, self.pose(joint));
+        }
+        position
     }
 
     /// Makes joint `anchor` the origin. All joints placed so far in its tree are its ancestors.
@@ -139,6 +232,9 @@ impl<S: Scalar> Poses<S> {
         while tree.joints[i].parent != WORLD {
             let parent = tree.joints[i].parent;
             self.position[parent] = self.position[i] - self.edge[i];
+            if S::BESIDE > 1 {
+                self.sides.put::<S>(parent, self.pose(parent));
+            }
             i = parent;
         }
     }
@@ -197,10 +293,4 @@ impl<S: Scalar> Poses<S> {
         };
         self.turned(tree, turning, turned)
     }
-}
-
-#[inline(always)]
-fn turned_about_z<S: Scalar>(frame: &Mat3, [s, c]: [S; 2]) -> Mat3<S> {
-    let Mat3([x, y, z]) = Mat3::lift(*frame);
-    Mat3([x * c + y * s, y * c - x * s, z])
 }

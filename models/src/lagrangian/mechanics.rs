@@ -1,7 +1,7 @@
 //! The Lagrangian of joint trees at a configuration and velocity, without springs: in the plane where the
 //! scene allows it, else in space.
 
-use plantd_math::scalar::{LanesOf, Truths};
+use plantd_math::scalar::{LanesOf, Scalar, Truths};
 use plantd_math::spatial::Mat3;
 use plantd_math::tree_lu::TreeLu;
 
@@ -26,7 +26,7 @@ pub(crate) struct Mechanics<S: Planar = f64> {
 
 /// Second derivatives that are put aside, of plants side by side.
 #[derive(Clone, Debug)]
-pub(crate) struct Kept<S> {
+pub(crate) struct Kept<S: Scalar> {
     curvature: Curvature<S>,
     slopes: Vec<Slopes<S>>,
 }
@@ -35,7 +35,7 @@ impl<S: Planar> Kept<S> {
     pub(crate) fn new(model: &Model) -> Self {
         let planar = model.planar.as_ref().map_or(0, |joints| joints.len());
         let slopes = vec![Slopes::default(); planar];
-        Self { curvature: Curvature::new(&model.dynamics), slopes }
+        Self { curvature: Curvature::new(&model.dynamics, model.gravity), slopes }
     }
 }
 
@@ -64,7 +64,7 @@ impl<S: Planar> Mechanics<S> {
             planar: model.planar.as_ref().map(|joints| Box::new(PlanarTree::new(joints))),
             poses: Poses::new(&model.dynamics),
             momenta: Momenta::new(&model.dynamics),
-            curvature: Curvature::new(&model.dynamics),
+            curvature: Curvature::new(&model.dynamics, model.gravity),
         }
     }
 
@@ -102,8 +102,7 @@ impl<S: Planar> Mechanics<S> {
         if let (Some(planar), Some(joints)) = (&self.planar, &model.planar) {
             planar.fill_newton_matrix(joints, &model.pairs, step, matrix);
         } else {
-            let (momenta, gravity) = (&self.momenta, model.gravity);
-            self.curvature.fill_newton_matrix(&model.pairs, momenta, gravity, step, matrix);
+            self.curvature.fill_newton_matrix(&model.pairs, step, matrix);
         }
     }
 
@@ -129,7 +128,7 @@ impl<S: Planar> Mechanics<S> {
     ) -> SecondDerivatives<S> {
         match (&self.planar, &model.planar) {
             (Some(planar), Some(joints)) => planar.pair(joints, ancestor, descendant),
-            _ => self.curvature.pair(&self.momenta, model.gravity, ancestor, descendant),
+            _ => self.curvature.pair(ancestor, descendant),
         }
     }
 
@@ -163,7 +162,7 @@ impl<S: Planar> Mechanics<S> {
             if joint.kind != JointKind::Ball(0) || joint.coordinate >= model.dimensions.dynamic {
                 continue;
             }
-            let within = self.curvature.within_ball(&self.momenta, model.gravity, first);
+            let within = self.curvature.within_ball(first);
             let i = joint.coordinate;
             for (a, b) in (0..9).map(|entry| (entry / 3, entry % 3)) {
                 let (qq, vv) = (within.tau_z.0[b][a], within.m_v.0[b][a]);

@@ -21,5 +21,6 @@ pub(crate) mod potentials;
 #[cfg(test)]
 pub(crate) mod samples;
 pub(crate) mod stop;
+pub(crate) mod sums;
 pub(crate) mod turning;
 pub(crate) mod vectors;

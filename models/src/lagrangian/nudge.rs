@@ -1,38 +1,33 @@
 //! How the gradient of the Lagrangian changes with a small change of the motion: its second derivatives times
 //! one vector, in O(n).
 //!
-//! With a change `a` of the coordinates and `b` of their velocities, and the vectors of
+//! With a change `a` of the coordinates and `b` of their velocities, and the rows of
 //! [`curvature`](crate::lagrangian::curvature),
 //!
 //! ```text
-//! root to leaf:  E_i = E_parent + J̇_i a_i + J_i b_i      Z_i = Z_parent + w_i a_i
-//! leaf to root:  G_i = P_i a_i + F_i b_i + Σ G_child      N_i = f_i a_i + Σ N_child
-//!                δL_q,i = P_i·E_parent + (f_i × g)·Z_parent + J̇_i·G_i + w_i·(N_i × g)
+//! root to leaf:  E_i = E_parent + rate_i a_i + axis_i b_i
+//! leaf to root:  G_i = slope_i a_i + force_i b_i + Σ G_child
+//!                δL_q,i = slope_i·E_parent + rate_i·G_i
 //! ```
 //!
-//! The axes of a ball joint turn with it. Of its own `a` and `b` they have `J̇ a` and `w a` among what is above
-//! them and `F b` among what is below, and of its momentum
+//! The axes of a ball joint turn with it. Of the sums over its own `a` and `b` they have `Σ rate a` among what is
+//! above them and `Σ force b` among what is below, and of its momentum
 //!
 //! ```text
-//! δL_v,i = F_i·(E_parent + Σ J̇ a + Σ J b) + J_i·Σ G_child
+//! δL_v,i = force_i·(E_parent + Σ rate a + Σ axis b) + axis_i·Σ G_child
 //! ```
 
-use plantd_math::scalar::{Scalar, in_registers};
-use plantd_math::spatial::{Force, Motion, Vec3};
+use plantd_math::scalar::{Beside, Scalar, Wide};
 
 use crate::lagrangian::arrangement::Planar;
+use crate::lagrangian::curvature::Curvature;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::model::mechanism::Model;
 use crate::model::tree::{Joint, JointKind, WORLD};
 
-/// What a joint passes on to those that it carries: `E` and `Z`.
-type Above<S> = (Motion<S>, Vec3<S>);
-/// What it passes on to its parent: `G` and `N`.
-type Below<S> = (Force<S>, Vec3<S>);
-
 /// A small change of the motion, and what it makes of the gradient.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Nudge<S = f64> {
+pub(crate) struct Nudge<S: Scalar = f64> {
     /// `a`: changes of the dynamic coordinates, of ball joints turns in their own axes. In planes those of prescribed
     /// coordinates follow, which are zero, here and in `b`.
     pub(crate) position: Vec<S>,
@@ -42,8 +37,38 @@ pub(crate) struct Nudge<S = f64> {
     pub(crate) l_q: Vec<S>,
     /// `δL_v`, of ball joints alone.
     pub(crate) l_v: Vec<S>,
-    above: Vec<Above<S>>,
-    below: Vec<Below<S>>,
+    /// `E` and `G` of each joint.
+    above: Vec<S::Row>,
+    below: Vec<S::Row>,
+}
+
+/// What [`Nudge::find`] does in space.
+struct Find<'a, S: Planar> {
+    nudge: &'a mut Nudge<S>,
+    model: &'a Model,
+    curvature: &'a Curvature<S>,
+}
+
+impl<S: Planar> Beside<S> for Find<'_, S> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<W: Wide<S>>(self) {
+        let Self { nudge, model, curvature } = self;
+        let joints = &model.dynamics.joints[..];
+        nudge.descend::<W>(joints, curvature);
+        if model.orientations.is_empty() {
+            nudge.ascend::<W, false>(joints, curvature);
+        } else {
+            nudge.ascend::<W, true>(joints, curvature);
+        }
+    }
+}
+
+/// `a x + b y`.
+#[inline(always)]
+fn sum_of<S: Scalar, W: Wide<S>>([a, b]: [&S::Row; 2], [x, y]: [S; 2]) -> W::Line {
+    W::sum(W::scaled(W::row(a), x), W::scaled(W::row(b), y))
 }
 
 impl<S: Planar> Nudge<S> {
@@ -59,8 +84,8 @@ impl<S: Planar> Nudge<S> {
             velocity: zeros(changes),
             l_q: zeros(nd),
             l_v: zeros(if model.orientations.is_empty() { 0 } else { nd }),
-            above: vec![Above::default(); joints],
-            below: vec![Below::default(); joints],
+            above: vec![S::Row::default(); joints],
+            below: vec![S::Row::default(); joints],
         }
     }
 
@@ -71,96 +96,120 @@ impl<S: Planar> Nudge<S> {
             (Some(planar), Some(joints)) => {
                 planar.nudge(joints, &self.position, &self.velocity, &mut self.l_q);
             }
-            _ => self.find_in_space(model, mechanics),
+            _ => self.find_in_space(model, &mechanics.curvature),
         }
     }
 
-    /// About 75 flops an axis.
+    /// About 100 flops an axis.
     #[inline(never)]
-    fn find_in_space(&mut self, model: &Model, mechanics: &Mechanics<S>) {
-        in_registers!(S, {
-            self.ascend(&model.dynamics.joints, mechanics);
-            if model.orientations.is_empty() {
-                self.descend::<false>(model, mechanics);
-            } else {
-                self.descend::<true>(model, mechanics);
-            }
-        });
+    fn find_in_space(&mut self, model: &Model, curvature: &Curvature<S>) {
+        S::beside(model.dynamics.joints.len(), Find { nudge: self, model, curvature });
     }
 
-    /// From the roots to the leaves.
+    /// How a coordinate changes; prescribed ones do not.
     #[inline(always)]
-    fn ascend(&mut self, joints: &[Joint], mechanics: &Mechanics<S>) {
-        let momenta = &mechanics.momenta;
-        let (axes, rates) = (&momenta.axis[..], &momenta.axis_rate[..]);
-        let (above, below) = (&mut self.above[..], &mut self.below[..]);
+    fn own(&self, coordinate: usize) -> [S; 2] {
+        match (self.position.get(coordinate), self.velocity.get(coordinate)) {
+            (Some(a), Some(b)) => [*a, *b],
+            _ => [S::ZERO; 2],
+        }
+    }
+
+    /// `E`, from the roots to the leaves.
+    #[inline(always)]
+    fn descend<W: Wide<S>>(&mut self, joints: &[Joint], curvature: &Curvature<S>) {
+        let Curvature { axis, rate, .. } = curvature;
+        let zero = W::row(&S::Row::default());
+        let mut last = zero;
         for (i, joint) in joints.iter().enumerate() {
-            let (mut motion, mut turn) = over(above, joint.parent);
-            if let Some(&a) = self.position.get(joint.coordinate) {
-                let b = self.velocity[joint.coordinate];
-                motion = motion.add_scaled(a, rates[i]).add_scaled(b, axes[i]);
-                turn += axes[i].w * a;
-            }
-            above[i] = (motion, turn);
-            below[i] = Below::default();
-        }
-    }
-
-    /// From the leaves to the roots; `BALLS`: some joint is a ball joint.
-    #[inline(always)]
-    fn descend<const BALLS: bool>(&mut self, model: &Model, mechanics: &Mechanics<S>) {
-        let Mechanics { momenta, curvature, .. } = mechanics;
-        let gravity = Vec3::lift(model.gravity.unwrap_or_default());
-        let (above, below) = (&self.above[..], &mut self.below[..]);
-        for (i, joint) in model.dynamics.joints.iter().enumerate().rev() {
-            let axes = match joint.kind {
-                JointKind::Ball(0) if BALLS => i..i + 3,
-                JointKind::Ball(_) if BALLS => continue,
-                _ => i..i + 1,
+            let above = match joint.parent {
+                WORLD => zero,
+                parent if parent + 1 == i => last,
+                parent => W::row(&self.above[parent]),
             };
-            let is_ball = BALLS && axes.len() == 3;
-            let children = below[axes.end - 1];
-            let (mut motion, mut turn) = over(above, joint.parent);
-            let (mut force, mut load) = children;
-            for k in axes.clone() {
-                let coordinate = joint.coordinate + (k - i);
-                let Some(&a) = self.position.get(coordinate) else { continue };
-                let b = self.velocity[coordinate];
-                force = force.add_scaled(b, curvature.force[k]);
-                if is_ball {
-                    motion = motion.add_scaled(a, momenta.axis_rate[k]);
-                    turn += momenta.axis[k].w * a;
-                } else {
-                    force = force.add_scaled(a, curvature.rate[k]);
-                    load += curvature.force[k].f * a;
-                }
-            }
-            let moved = above[axes.end - 1].0;
-            let (mut passed, mut passed_load) = (force, load);
-            for k in axes {
-                let coordinate = joint.coordinate + (k - i);
-                let Some(&a) = self.position.get(coordinate) else { continue };
-                let (axis, rate) = (momenta.axis[k], momenta.axis_rate[k]);
-                let (own, slope) = (curvature.force[k], curvature.rate[k]);
-                self.l_q[coordinate] = (motion.dot(slope) + rate.dot(force))
-                    + (own.f.cross(gravity).dot(turn) + axis.w.dot(load.cross(gravity)));
-                if is_ball {
-                    self.l_v[coordinate] = moved.dot(own) + axis.dot(children.0);
-                    passed = passed.add_scaled(a, slope);
-                    passed_load += own.f * a;
-                }
-            }
-            if joint.parent != WORLD {
-                let (force, load) = below[joint.parent];
-                below[joint.parent] = (force.plus(passed), load + passed_load);
-            }
+            let own = self.own(joint.coordinate);
+            last = W::sum(above, sum_of::<S, W>([&rate[i], &axis[i]], own));
+            W::put_row(last, &mut self.above[i]);
+            self.below[i] = S::Row::default();
         }
     }
-}
 
-#[inline(always)]
-fn over<S: Scalar>(above: &[Above<S>], parent: usize) -> Above<S> {
-    if parent == WORLD { Above::default() } else { above[parent] }
+    /// `G` and the changes, from the leaves to the roots; `BALLS`: some joint is a ball joint.
+    #[inline(always)]
+    fn ascend<W: Wide<S>, const BALLS: bool>(
+        &mut self,
+        joints: &[Joint],
+        curvature: &Curvature<S>,
+    ) {
+        let Curvature { rate, force, slope, .. } = curvature;
+        let zero = W::row(&S::Row::default());
+        // What the joint after this one passes on to it stays in registers.
+        let mut next = zero;
+        for (i, joint) in joints.iter().enumerate().rev() {
+            let children;
+            let first = match joint.kind {
+                JointKind::Ball(2) if BALLS => {
+                    children = W::sum(W::row(&self.below[i]), next);
+                    next = self.ascend_ball::<W>(i - 2, joint.coordinate - 2, children, curvature);
+                    i - 2
+                }
+                JointKind::Ball(_) if BALLS => continue,
+                _ => {
+                    let own = self.own(joint.coordinate);
+                    children = W::sum(W::row(&self.below[i]), next);
+                    next = W::sum(children, sum_of::<S, W>([&slope[i], &force[i]], own));
+                    if let Some(l_q) = self.l_q.get_mut(joint.coordinate) {
+                        let above = match joint.parent {
+                            WORLD => zero,
+                            parent => W::row(&self.above[parent]),
+                        };
+                        *l_q = W::dots([W::row(&slope[i]), above], [W::row(&rate[i]), next]);
+                    }
+                    i
+                }
+            };
+            let parent = joints[first].parent;
+            if parent.wrapping_add(1) == first && first > 0 {
+                continue;
+            }
+            if parent != WORLD {
+                let all = &mut self.below[parent];
+                W::put_row(W::sum(W::row(all), next), all);
+            }
+            next = zero;
+        }
+    }
+
+    /// The same for the axes of a ball joint, which begin with the joint `first` and the coordinate `own`;
+    /// returns what they and their children pass on.
+    #[inline(always)]
+    fn ascend_ball<W: Wide<S>>(
+        &mut self,
+        first: usize,
+        own: usize,
+        children: W::Line,
+        curvature: &Curvature<S>,
+    ) -> W::Line {
+        let Curvature { axis, rate, force, slope, .. } = curvature;
+        let moved = W::row(&self.above[first + 2]);
+        let (mut above, mut below, mut all) = (moved, children, children);
+        for k in 0..3 {
+            let [a, b] = self.own(own + k);
+            // Of what they have added, what comes of their speed.
+            above = W::sum(above, W::scaled(W::row(&axis[first + k]), -b));
+            below = W::sum(below, W::scaled(W::row(&force[first + k]), b));
+            all = W::sum(all, sum_of::<S, W>([&slope[first + k], &force[first + k]], [a, b]));
+        }
+        for (k, i) in (own..own + 3).enumerate() {
+            let (axis, rate) = (W::row(&axis[first + k]), W::row(&rate[first + k]));
+            let (force, slope) = (W::row(&force[first + k]), W::row(&slope[first + k]));
+            if let (Some(l_q), Some(l_v)) = (self.l_q.get_mut(i), self.l_v.get_mut(i)) {
+                *l_q = W::dots([slope, above], [rate, below]);
+                *l_v = W::dots([force, moved], [axis, children]);
+            }
+        }
+        all
+    }
 }
 
 #[cfg(test)]

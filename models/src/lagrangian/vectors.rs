@@ -121,7 +121,7 @@ impl PointPair {
 /// ```
 ///
 /// Where the points coincide it has no direction; then the derivatives are zero.
-pub(crate) struct Distance<'a, S> {
+pub(crate) struct Distance<'a, S: Scalar> {
     pair: &'a PointPair,
     tree: &'a Tree,
     poses: &'a Poses<S>,
@@ -174,7 +174,7 @@ impl<'a, S: Scalar> Distance<'a, S> {
 /// ```
 ///
 /// Joints that carry both bodies turn both vectors alike, and change nothing.
-pub(crate) struct ProductAt<'a, S> {
+pub(crate) struct ProductAt<'a, S: Scalar> {
     product: &'a Product,
     tree: &'a Tree,
     poses: &'a Poses<S>,

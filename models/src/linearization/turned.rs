@@ -14,19 +14,17 @@
 //! [`generators`](crate::lagrangian::generators); springs and forces come entry by entry, and each goes to all
 //! rows and columns of the ball joints that it belongs to.
 
-use plantd_math::eights::Eight;
+use plantd_math::eights::{Eight, InEights, in_eights};
 use plantd_math::rotation;
-use plantd_math::simd::widest;
 use plantd_math::spatial::{Mat3, three};
 
 use crate::integrator::balls::BallJoints;
 use crate::integrator::workspace::{StepContext, Tangents, Workspace};
 use crate::lagrangian::curvature::Within;
-use crate::lagrangian::generators::Parts;
-use crate::lagrangian::mechanics::Mechanics;
+use crate::lagrangian::generators::{Flanks, Parts};
 use crate::lagrangian::turning::Turning;
 use crate::linearization::linearize::Linearization;
-use crate::model::mechanism::Model;
+use crate::model::mechanism::{Model, Pair};
 use crate::model::tree::JointKind;
 
 /// Derivatives of torque, momentum and force of one coordinate by position and velocity of another.
@@ -145,33 +143,9 @@ impl Sink<'_> {
         let (nd, stride) = (self.nd, self.stride);
         let (increment, momentum) = (&mut *self.increment, &mut *self.momentum);
         let Tangents { flanks, end_slopes, .. } = &mut *self.tangents;
-        widest!({
-            end_slopes.fill(0.0);
-            for pair in &model.pairs {
-                let (i, j) = (pair.row as usize, pair.column as usize);
-                let (a, d) = (&flanks[pair.ancestor as usize], &flanks[pair.descendant as usize]);
-                if !(a.is_turned || d.is_turned) {
-                    // ¼h L_qq, ½ L_vq and ½ L_qv.
-                    let Parts { axis, rate, .. } = &a.parts;
-                    let Parts { force, slope, .. } = &d.parts;
-                    let [qq, vq, qv] = [rate.dot(*slope), axis.dot(*slope), rate.dot(*force)];
-                    let (half, vq, qv) = (2.0 * qq, 2.0 * vq, 2.0 * qv);
-                    increment[i * stride + j] = half - vq;
-                    increment[j * stride + i] = half - qv;
-                    end_slopes[i * nd + j] = half + qv;
-                    end_slopes[j * nd + i] = half + vq;
-                    momentum[i * stride + j] = 2.0 * half;
-                    momentum[j * stride + i] = 2.0 * half;
-                    continue;
-                }
-                increment[i * stride + j] = a.newton.minus.dot(d.below);
-                increment[j * stride + i] = a.above.dot(d.newton.lower);
-                momentum[i * stride + j] = a.carry.dot(d.below);
-                momentum[j * stride + i] = a.above.dot(d.push);
-                end_slopes[i * nd + j] = a.carry.dot(d.newton.upper);
-                end_slopes[j * nd + i] = a.newton.plus.dot(d.push);
-            }
-        });
+        end_slopes.fill(0.0);
+        let pairs = &model.pairs[..];
+        in_eights(PutPairs { pairs, flanks, increment, momentum, end_slopes, nd, stride });
     }
 
     /// The same for the axes of one ball joint. The change of `m × ξ + (2a − 1) h (T⁻ − 1) f` with `ξ` is
@@ -198,6 +172,50 @@ impl Sink<'_> {
     }
 }
 
+/// What [`Sink::put_pairs`] does.
+struct PutPairs<'a> {
+    pairs: &'a [Pair],
+    flanks: &'a [Flanks],
+    increment: &'a mut [f64],
+    momentum: &'a mut [f64],
+    end_slopes: &'a mut [f64],
+    nd: usize,
+    stride: usize,
+}
+
+impl InEights for PutPairs<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<E: Eight>(self) {
+        let Self { pairs, flanks, increment, momentum, end_slopes, nd, stride } = self;
+        for pair in pairs {
+            let (i, j) = (pair.row as usize, pair.column as usize);
+            let (a, d) = (&flanks[pair.ancestor as usize], &flanks[pair.descendant as usize]);
+            if !(a.is_turned || d.is_turned) {
+                // ¼h L_qq, ½ L_vq and ½ L_qv.
+                let Parts { axis, rate, .. } = &a.parts;
+                let Parts { force, slope, .. } = &d.parts;
+                let half = 2.0 * E::dot_of(rate, slope);
+                let (vq, qv) = (2.0 * E::dot_of(axis, slope), 2.0 * E::dot_of(rate, force));
+                increment[i * stride + j] = half - vq;
+                increment[j * stride + i] = half - qv;
+                end_slopes[i * nd + j] = half + qv;
+                end_slopes[j * nd + i] = half + vq;
+                momentum[i * stride + j] = 2.0 * half;
+                momentum[j * stride + i] = 2.0 * half;
+                continue;
+            }
+            increment[i * stride + j] = E::dot_of(&a.newton.minus, &d.below);
+            increment[j * stride + i] = E::dot_of(&a.above, &d.newton.lower);
+            momentum[i * stride + j] = E::dot_of(&a.carry, &d.below);
+            momentum[j * stride + i] = E::dot_of(&a.above, &d.push);
+            end_slopes[i * nd + j] = E::dot_of(&a.carry, &d.newton.upper);
+            end_slopes[j * nd + i] = E::dot_of(&a.newton.plus, &d.push);
+        }
+    }
+}
+
 impl Workspace {
     /// Writes `r1'` into `out.increment` and starts `out.momentum`, both zero, with what does not depend on `x'`,
     /// but for constraints and momenta; the second derivatives are those of the last Newton matrix.
@@ -211,13 +229,7 @@ impl Workspace {
         let balls = &*balls;
         let turns = model.orientations.iter().zip(&balls.turns);
         out.turnings.extend(turns.map(|(&i, turn)| Turning::new(model, i, turn.xi, h)));
-        tangents.find_flanks(
-            model,
-            &mid.mechanics,
-            (&out.turnings, &kkt.balls),
-            &balls.vertical,
-            h,
-        );
+        tangents.find_flanks(model, &mid.mechanics.curvature, (&out.turnings, &kkt.balls), h);
         let split = h * out.at_start;
         let mut sink = Sink {
             balls,
@@ -242,8 +254,7 @@ impl Workspace {
                 let momentum = three(&mid.l_v, i);
                 let turned = rotation::crossed(-momentum);
                 let turned = turned.plus(&forces.scaled(sink.skew));
-                let Mechanics { momenta, curvature, .. } = &mid.mechanics;
-                let within = curvature.within_ball(momenta, model.gravity, first);
+                let within = mid.mechanics.curvature.within_ball(first);
                 sink.put_ball(turning, &within, &turned);
             }
         }

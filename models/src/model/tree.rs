@@ -1,6 +1,9 @@
 //! The joint tree as a step walks it: depth first, fixed joints merged into their parents, every
 //! joint turned so that its axis is its own z axis.
 
+use plantd_math::rows::{Block, LANES};
+use plantd_math::scalar::{Scalar, Wide};
+use plantd_math::sided::Composite;
 use plantd_math::spatial::{Mat3, Sym3, Vec3};
 
 /// "No parent": the joint hangs from the world.
@@ -85,9 +88,80 @@ pub(crate) struct Tree {
     pub(crate) joints: Vec<Joint>,
     /// Some joint is neither revolute nor prismatic.
     pub(crate) has_other_joints: bool,
+    /// Some joint is a ball joint.
+    pub(crate) has_balls: bool,
+    /// Some body is more than a point mass.
+    has_spin: bool,
+    /// What is fixed to the joints, of eight side by side.
+    eights: Vec<Fixed<Block>>,
+}
+
+/// What is fixed to a joint, of several side by side: what the passes over a tree compute with.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Fixed<S> {
+    /// How the joint turns about its z axis, and slides along it, with its coordinate: 1 and 0 of a hinge.
+    pub(crate) turns: S,
+    pub(crate) slides: S,
+    pub(crate) mass: S,
+    pub(crate) center: Vec3<S>,
+    /// About the centre of mass.
+    pub(crate) inertia: Sym3<S>,
+    pub(crate) subtree_mass: S,
+}
+
+impl Fixed<Block> {
+    fn of(joints: &[Joint]) -> Self {
+        let mut fixed = Self::default();
+        for (lane, joint) in joints.iter().enumerate() {
+            let (turns, slides) = match joint.kind {
+                JointKind::Prismatic => (0.0, 1.0),
+                JointKind::Screw(pitch) => (1.0, pitch),
+                JointKind::Revolute | JointKind::Ball(_) => (1.0, 0.0),
+            };
+            let Body { mass, center, inertia } = joint.body;
+            let inertia = match inertia {
+                Rotational::None | Rotational::Point => Sym3::default(),
+                Rotational::Isotropic(i) => Sym3 { xx: i, yy: i, zz: i, ..Sym3::default() },
+                Rotational::Full(tensor) => tensor,
+            };
+            turns.put(&mut fixed.turns, lane);
+            slides.put(&mut fixed.slides, lane);
+            mass.put(&mut fixed.mass, lane);
+            fixed.center.zip(center, |numbers, number: f64| number.put(numbers, lane));
+            fixed.inertia.zip(inertia, |numbers, number: f64| number.put(numbers, lane));
+            joint.subtree_mass.put(&mut fixed.subtree_mass, lane);
+        }
+        fixed
+    }
 }
 
 impl Tree {
+    /// What is fixed to the joints that begin with `i`, side by side.
+    #[inline(always)]
+    pub(crate) fn fixed<S: Scalar, W: Wide<S>>(&self, i: usize) -> Fixed<W> {
+        let (eight, lane) = (&self.eights[i / LANES], i % LANES);
+        let of = |numbers: &Block| W::constants(numbers, lane);
+        Fixed {
+            turns: of(&eight.turns),
+            slides: of(&eight.slides),
+            mass: of(&eight.mass),
+            center: eight.center.map(of),
+            inertia: eight.inertia.map(of),
+            subtree_mass: of(&eight.subtree_mass),
+        }
+    }
+
+    /// What there is to know of the rotational inertia of the joints that begin with `i`: of several side by side, the
+    /// most that any has.
+    #[inline(always)]
+    pub(crate) fn rotational<S: Scalar>(&self, i: usize) -> Rotational {
+        match self.joints[i].body.inertia {
+            inertia if S::BESIDE == 1 => inertia,
+            _ if self.has_spin => Rotational::Full(Sym3::default()),
+            _ => Rotational::Point,
+        }
+    }
+
     /// The joints of `all` for which `keep` holds, re-indexed, and the map from old to new indices.
     /// `keep` must hold for the parent of every kept joint.
     pub(crate) fn pruned(all: &[Joint], keep: &[bool]) -> (Self, Vec<usize>) {
@@ -102,7 +176,12 @@ impl Tree {
         let simple =
             |joint: &Joint| matches!(joint.kind, JointKind::Revolute | JointKind::Prismatic);
         let has_other_joints = !joints.iter().all(simple);
-        let mut tree = Self { joints, has_other_joints };
+        let has_balls = joints.iter().any(|joint| matches!(joint.kind, JointKind::Ball(_)));
+        let has_spin = joints.iter().any(|joint| {
+            matches!(joint.body.inertia, Rotational::Isotropic(_) | Rotational::Full(_))
+        });
+        let eights = joints.chunks(LANES).map(Fixed::of).collect();
+        let mut tree = Self { joints, has_other_joints, has_balls, has_spin, eights };
         tree.place_anchors();
         (tree, index)
     }

@@ -379,11 +379,7 @@ impl Workspace {
             &self.mid.mechanics.momenta,
         );
         self.kkt.factored.tree.clear();
-        self.mid.mechanics.curvature.fill_mass_matrix(
-            &model.pairs,
-            &self.mid.mechanics.momenta,
-            &mut self.kkt.factored.tree,
-        );
+        self.mid.mechanics.curvature.fill_mass_matrix(&model.pairs, &mut self.kkt.factored.tree);
         for entry in &model.armature {
             armature::add_to(&mut self.kkt.factored.tree, model, entry, 1.0);
         }

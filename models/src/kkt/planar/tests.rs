@@ -62,12 +62,7 @@ fn gradients_and_second_derivatives_are_those_in_space() {
         for descendant in 0..joints.len() {
             for ancestor in model.dynamics.path(descendant) {
                 let a = planar.pair(joints, ancestor, descendant);
-                let b = workspace.mid.mechanics.curvature.pair(
-                    &workspace.mid.mechanics.momenta,
-                    model.gravity,
-                    ancestor,
-                    descendant,
-                );
+                let b = workspace.mid.mechanics.curvature.pair(ancestor, descendant);
                 let scale = 1e3;
                 assert_close(a.qq, b.qq, scale, "qq");
                 assert_close(a.v_above_q_below, b.v_above_q_below, scale, "vq");

@@ -123,7 +123,8 @@ impl PointForce {
             (&self.ends.b, separation.b)
         };
         let carried = twist(at, end);
-        let turned = at.momenta.axis[joint.joint].cross(carried.minus(before(at, joint.joint)));
+        let turned =
+            at.momenta.axis.get::<S>(joint.joint).cross(carried.minus(before(at, joint.joint)));
         let turned = turned.at(point);
         let turned = if joint.carries == Carries::A { turned } else { -turned };
         turned + carried.w.cross(gradient)
@@ -132,7 +133,7 @@ impl PointForce {
 
 /// Twist of what a point is fixed to.
 fn twist<S: Scalar>(at: &Instant<'_, S>, end: &Attachment) -> Motion<S> {
-    if end.joint == WORLD { Motion::default() } else { at.momenta.twist[end.joint] }
+    if end.joint == WORLD { Motion::default() } else { at.momenta.twist.get(end.joint) }
 }
 
 /// Twist of what a joint hangs from; for an axis of a ball joint, what the whole joint hangs from.
@@ -143,6 +144,6 @@ fn before<S: Scalar>(at: &Instant<'_, S>, joint: usize) -> Motion<S> {
     };
     match at.tree.joints[first].parent {
         WORLD => Motion::default(),
-        parent => at.momenta.twist[parent],
+        parent => at.momenta.twist.get(parent),
     }
 }

@@ -1,0 +1,518 @@
+//! Several numbers of a kind side by side in registers: eight reals, or one number of each of several plants.
+//!
+//! What is computed alike for all entries of a list is written once, for [`Wide`] numbers, and [`Scalar::beside`] does
+//! it for as many as the processor has registers for.
+
+use std::fmt::{self, Debug, Formatter};
+use std::marker::PhantomData;
+use std::ops::{Add, AddAssign, Mul, Neg, Sub, SubAssign};
+
+#[cfg(target_arch = "x86_64")]
+use crate::eights::registers::{Halves, Low, Whole};
+use crate::eights::{Eight, InEights, in_eights};
+use crate::rows::{Block, sum_of_eight};
+use crate::scalar::{Dual, LanesOf, Scalar, operators};
+#[cfg(target_arch = "x86_64")]
+use crate::simd::{AVX2, AVX512, has};
+
+/// Numbers side by side in registers, of which [`Scalar::Several`] lie in memory.
+pub trait Wide<S: Scalar>: Scalar {
+    /// From memory.
+    fn load(several: &S::Several) -> Self;
+    /// To memory.
+    fn store(self, several: &mut S::Several);
+    /// Constants: all eight, or the one in a lane.
+    fn constants(eight: &Block, lane: usize) -> Self;
+    /// The same number everywhere.
+    fn of_one(number: &S) -> Self;
+    /// A row in registers.
+    type Line: Copy;
+    /// From memory.
+    fn row(row: &S::Row) -> Self::Line;
+    /// To memory.
+    fn put_row(row: Self::Line, to: &mut S::Row);
+    /// The sum, number by number.
+    fn sum(a: Self::Line, b: Self::Line) -> Self::Line;
+    /// All numbers times a factor.
+    fn scaled(line: Self::Line, factor: S) -> Self::Line;
+    /// The sum of the products of two lines.
+    fn dot_of(a: Self::Line, b: Self::Line) -> S;
+    /// The sum of the products of two lines, and of two more.
+    fn dots(a: [Self::Line; 2], b: [Self::Line; 2]) -> S;
+    /// Three numbers that belong together.
+    type Triple: Copy;
+    /// From memory.
+    fn triple(numbers: &[S; 3]) -> Self::Triple;
+    /// To memory.
+    fn put_triple(triple: Self::Triple, to: &mut [S; 3]);
+    /// The sum, number by number.
+    fn triple_sum(a: Self::Triple, b: Self::Triple) -> Self::Triple;
+    /// All numbers times a factor.
+    fn triple_scaled(triple: Self::Triple, factor: S) -> Self::Triple;
+    /// All numbers times a constant.
+    fn triple_times(triple: Self::Triple, factor: f64) -> Self::Triple;
+    /// To rows, of which there are [`Scalar::BESIDE`]: each gets one of all eight.
+    fn spread(numbers: [Self; 8], rows: &mut [S::Row]);
+    /// The way back.
+    fn collect(rows: &[S::Row]) -> [Self; 8];
+}
+
+/// What is done with numbers side by side.
+pub trait Beside<S: Scalar> {
+    /// What comes out.
+    type Output;
+    /// Does it. Always inlined, as is all that works on these numbers in it.
+    fn run<W: Wide<S>>(self) -> Self::Output;
+}
+
+/// Numbers that lie alone: nothing is beside them.
+macro_rules! alone {
+    ([$($generic:tt)*] $type:ty) => {
+        impl<$($generic)*> Wide<Self> for $type {
+            type Line = [Self; 8];
+            type Triple = [Self; 3];
+            #[inline(always)]
+            fn triple(numbers: &[Self; 3]) -> [Self; 3] {
+                *numbers
+            }
+            #[inline(always)]
+            fn put_triple(triple: [Self; 3], to: &mut [Self; 3]) {
+                *to = triple;
+            }
+            #[inline(always)]
+            fn triple_sum([a, b, c]: [Self; 3], [d, e, f]: [Self; 3]) -> [Self; 3] {
+                [a + d, b + e, c + f]
+            }
+            #[inline(always)]
+            fn triple_scaled([a, b, c]: [Self; 3], factor: Self) -> [Self; 3] {
+                [a * factor, b * factor, c * factor]
+            }
+            #[inline(always)]
+            fn triple_times([a, b, c]: [Self; 3], factor: f64) -> [Self; 3] {
+                [a * factor, b * factor, c * factor]
+            }
+            #[inline(always)]
+            fn load(several: &Self) -> Self {
+                *several
+            }
+            #[inline(always)]
+            fn store(self, several: &mut Self) {
+                *several = self;
+            }
+            #[inline(always)]
+            fn constants(eight: &Block, lane: usize) -> Self {
+                Self::constant(eight.0[lane])
+            }
+            #[inline(always)]
+            fn of_one(number: &Self) -> Self {
+                *number
+            }
+            #[inline(always)]
+            fn row(row: &[Self; 8]) -> [Self; 8] {
+                *row
+            }
+            #[inline(always)]
+            fn put_row(row: [Self; 8], to: &mut [Self; 8]) {
+                *to = row;
+            }
+            #[inline(always)]
+            fn sum(mut a: [Self; 8], b: [Self; 8]) -> [Self; 8] {
+                for (a, b) in a.iter_mut().zip(b) {
+                    *a += b;
+                }
+                a
+            }
+            #[inline(always)]
+            fn scaled(mut line: [Self; 8], factor: Self) -> [Self; 8] {
+                for number in &mut line {
+                    *number = *number * factor;
+                }
+                line
+            }
+            #[inline(always)]
+            fn dot_of(a: [Self; 8], b: [Self; 8]) -> Self {
+                Self::dot(&a, &b)
+            }
+            #[inline(always)]
+            fn dots([a, b]: [[Self; 8]; 2], [c, d]: [[Self; 8]; 2]) -> Self {
+                let mut products = a;
+                for (k, product) in products.iter_mut().enumerate() {
+                    *product = a[k] * b[k] + c[k] * d[k];
+                }
+                sum_of_eight(products)
+            }
+            #[inline(always)]
+            fn spread(numbers: [Self; 8], rows: &mut [[Self; 8]]) {
+                rows[0] = numbers;
+            }
+            #[inline(always)]
+            fn collect(rows: &[[Self; 8]]) -> [Self; 8] {
+                rows[0]
+            }
+        }
+    };
+}
+
+alone! { [S: Scalar] Dual<S> }
+alone! { [const N: usize] LanesOf<N> }
+
+/// Eight numbers that are computed with as one is, number by number; rows are computed with as `L`.
+#[derive(Clone, Copy)]
+pub(super) struct Sides<E, L>(E, PhantomData<L>);
+
+impl<E: Eight, L: Eight> Sides<E, L> {
+    #[inline(always)]
+    fn new(numbers: E) -> Self {
+        Self(numbers, PhantomData)
+    }
+
+    #[inline(always)]
+    fn of_plants<const N: usize>(numbers: &LanesOf<N>) -> Self {
+        Self::new(E::of_list(&numbers.0))
+    }
+
+    #[inline(always)]
+    fn put_plants<const N: usize>(self, to: &mut LanesOf<N>) {
+        self.0.put_list(&mut to.0);
+    }
+
+    #[inline(always)]
+    fn block(self) -> Block {
+        let mut block = Block::ZERO;
+        self.0.put(&mut block);
+        block
+    }
+
+    fn each(self, of: impl Fn(f64) -> f64) -> Self {
+        Self::new(E::of(&Block(self.block().0.map(of))))
+    }
+}
+
+impl<E: Eight, L: Eight> Default for Sides<E, L> {
+    #[inline(always)]
+    fn default() -> Self {
+        Self::new(E::all(0.0))
+    }
+}
+
+impl<E: Eight, L: Eight> PartialEq for Sides<E, L> {
+    fn eq(&self, other: &Self) -> bool {
+        self.block().0 == other.block().0
+    }
+}
+
+impl<E: Eight, L: Eight> Debug for Sides<E, L> {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        self.block().fmt(f)
+    }
+}
+
+operators! { [E: Eight, L: Eight] Sides<E, L>;
+    Neg neg(a) { Self::new(E::all(-0.0).minus(a.0)) }
+    Add add(a, b: Self) { Self::new(a.0.plus(b.0)) }
+    Sub sub(a, b: Self) { Self::new(a.0.minus(b.0)) }
+    Mul mul(a, b: Self) { Self::new(a.0.times(b.0)) }
+    Add add(a, b: f64) { Self::new(a.0.plus(E::all(b))) }
+    Sub sub(a, b: f64) { Self::new(a.0.minus(E::all(b))) }
+    Mul mul(a, b: f64) { Self::new(a.0.scaled(b)) }
+    AddAssign add_assign(mut a, b) { *a + b }
+    SubAssign sub_assign(mut a, b) { *a - b }
+}
+
+impl<E: Eight, L: Eight> Scalar for Sides<E, L> {
+    type Several = Self;
+    type Row = [Self; 8];
+    const BESIDE: usize = 1;
+    const ZERO: Self = Self(E::ZERO, PhantomData);
+    const ONE: Self = Self(E::ONE, PhantomData);
+    const IS_SEVERAL: bool = true;
+    #[inline(always)]
+    fn several(of: impl Fn(usize) -> Self) -> Self {
+        of(0)
+    }
+    #[inline(always)]
+    fn one(several: &Self, _: usize) -> Self {
+        *several
+    }
+    #[inline(always)]
+    fn put(self, several: &mut Self, _: usize) {
+        *several = self;
+    }
+    #[inline(always)]
+    fn entry(row: &[Self; 8], k: usize) -> Self {
+        row[k]
+    }
+    #[inline(always)]
+    fn dot(a: &[Self; 8], b: &[Self; 8]) -> Self {
+        let mut products = *a;
+        for (product, b) in products.iter_mut().zip(b) {
+            *product = *product * *b;
+        }
+        sum_of_eight(products)
+    }
+    #[inline(always)]
+    fn dot_of_six(a: &[Self; 8], b: &[Self; 8]) -> Self {
+        let product = |k: usize| a[k] * b[k];
+        let half = |k: usize| product(k) + product(k + 4);
+        (half(0) + product(2)) + (half(1) + product(3))
+    }
+    #[inline(always)]
+    fn beside<T: Beside<Self>>(_: usize, task: T) -> T::Output {
+        task.run::<Self>()
+    }
+    #[inline(always)]
+    fn constant(value: f64) -> Self {
+        Self::new(E::all(value))
+    }
+    fn value(self) -> f64 {
+        self.block().0[0]
+    }
+    fn sin_cos(self) -> (Self, Self) {
+        (self.each(|x| x.sin_cos().0), self.each(|x| x.sin_cos().1))
+    }
+    fn sqrt(self) -> Self {
+        self.each(f64::sqrt)
+    }
+    fn recip(self) -> Self {
+        self.each(f64::recip)
+    }
+    fn tanh(self) -> Self {
+        self.each(libm::tanh)
+    }
+    fn atan2(self, x: Self) -> Self {
+        let (y, x) = (self.block().0, x.block().0);
+        Self::new(E::of(&Block(std::array::from_fn(|i| libm::atan2(y[i], x[i])))))
+    }
+}
+
+alone! { [E: Eight, L: Eight] Sides<E, L> }
+
+impl<E: Eight, L: Eight> Wide<f64> for Sides<E, L> {
+    #[inline(always)]
+    fn load(several: &Block) -> Self {
+        Self::new(E::of(several))
+    }
+    #[inline(always)]
+    fn store(self, several: &mut Block) {
+        self.0.put(several);
+    }
+    #[inline(always)]
+    fn constants(eight: &Block, _: usize) -> Self {
+        Self::new(E::of(eight))
+    }
+    #[inline(always)]
+    fn of_one(number: &f64) -> Self {
+        Self::new(E::all(*number))
+    }
+    type Line = L;
+    type Triple = L::Four;
+    #[inline(always)]
+    fn triple([x, y, z]: &[f64; 3]) -> L::Four {
+        L::Four::of_list(&[*x, *y, *z, 0.0])
+    }
+    #[inline(always)]
+    fn put_triple(triple: L::Four, to: &mut [f64; 3]) {
+        let mut four = [0.0; 4];
+        triple.put_list(&mut four);
+        to.copy_from_slice(&four[..3]);
+    }
+    #[inline(always)]
+    fn triple_sum(a: L::Four, b: L::Four) -> L::Four {
+        a.plus(b)
+    }
+    #[inline(always)]
+    fn triple_scaled(triple: L::Four, factor: f64) -> L::Four {
+        triple.scaled(factor)
+    }
+    #[inline(always)]
+    fn triple_times(triple: L::Four, factor: f64) -> L::Four {
+        triple.scaled(factor)
+    }
+    #[inline(always)]
+    fn row(row: &Block) -> L {
+        L::of(row)
+    }
+    #[inline(always)]
+    fn put_row(row: L, to: &mut Block) {
+        row.put(to);
+    }
+    #[inline(always)]
+    fn sum(a: L, b: L) -> L {
+        a.plus(b)
+    }
+    #[inline(always)]
+    fn scaled(line: L, factor: f64) -> L {
+        line.scaled(factor)
+    }
+    #[inline(always)]
+    fn dot_of(a: L, b: L) -> f64 {
+        a.dot(b)
+    }
+    #[inline(always)]
+    fn dots([a, b]: [L; 2], [c, d]: [L; 2]) -> f64 {
+        a.times(b).plus(c.times(d)).sum()
+    }
+    #[inline(always)]
+    fn spread([a, b, c, d, e, f, g, h]: [Self; 8], rows: &mut [Block]) {
+        E::spread([a.0, b.0, c.0, d.0, e.0, f.0, g.0, h.0], rows);
+    }
+    #[inline(always)]
+    fn collect(rows: &[Block]) -> [Self; 8] {
+        let mut out = [Self::ZERO; 8];
+        for (out, own) in out.iter_mut().zip(E::collect(rows)) {
+            *out = Self::new(own);
+        }
+        out
+    }
+}
+
+/// Of plants side by side.
+impl<E: Eight, L: Eight, const N: usize> Wide<LanesOf<N>> for Sides<E, L> {
+    type Line = [Self; 8];
+    type Triple = [Self; 3];
+    #[inline(always)]
+    fn triple([x, y, z]: &[LanesOf<N>; 3]) -> [Self; 3] {
+        [Self::of_plants(x), Self::of_plants(y), Self::of_plants(z)]
+    }
+    #[inline(always)]
+    fn put_triple(triple: [Self; 3], to: &mut [LanesOf<N>; 3]) {
+        for (own, to) in triple.into_iter().zip(to) {
+            own.put_plants(to);
+        }
+    }
+    #[inline(always)]
+    fn triple_sum(a: [Self; 3], b: [Self; 3]) -> [Self; 3] {
+        <Self as Wide<Self>>::triple_sum(a, b)
+    }
+    #[inline(always)]
+    fn triple_scaled(triple: [Self; 3], factor: LanesOf<N>) -> [Self; 3] {
+        <Self as Wide<Self>>::triple_scaled(triple, Self::of_plants(&factor))
+    }
+    #[inline(always)]
+    fn triple_times(triple: [Self; 3], factor: f64) -> [Self; 3] {
+        <Self as Wide<Self>>::triple_times(triple, factor)
+    }
+    #[inline(always)]
+    fn load(several: &LanesOf<N>) -> Self {
+        Self::of_plants(several)
+    }
+    #[inline(always)]
+    fn store(self, several: &mut LanesOf<N>) {
+        self.put_plants(several);
+    }
+    #[inline(always)]
+    fn constants(eight: &Block, lane: usize) -> Self {
+        Self::constant(eight.0[lane])
+    }
+    #[inline(always)]
+    fn of_one(number: &LanesOf<N>) -> Self {
+        Self::of_plants(number)
+    }
+    #[inline(always)]
+    fn row(row: &[LanesOf<N>; 8]) -> [Self; 8] {
+        let mut line = [Self::ZERO; 8];
+        for (own, number) in line.iter_mut().zip(row) {
+            *own = Self::of_plants(number);
+        }
+        line
+    }
+    #[inline(always)]
+    fn put_row(row: [Self; 8], to: &mut [LanesOf<N>; 8]) {
+        for (own, to) in row.into_iter().zip(to) {
+            own.put_plants(to);
+        }
+    }
+    #[inline(always)]
+    fn sum(a: [Self; 8], b: [Self; 8]) -> [Self; 8] {
+        <Self as Wide<Self>>::sum(a, b)
+    }
+    #[inline(always)]
+    fn scaled(line: [Self; 8], factor: LanesOf<N>) -> [Self; 8] {
+        <Self as Wide<Self>>::scaled(line, Self::of_plants(&factor))
+    }
+    #[inline(always)]
+    fn dot_of(a: [Self; 8], b: [Self; 8]) -> LanesOf<N> {
+        let mut dot = LanesOf::ZERO;
+        <Self as Wide<Self>>::dot_of(a, b).put_plants(&mut dot);
+        dot
+    }
+    #[inline(always)]
+    fn dots(a: [[Self; 8]; 2], b: [[Self; 8]; 2]) -> LanesOf<N> {
+        let mut dots = LanesOf::ZERO;
+        <Self as Wide<Self>>::dots(a, b).put_plants(&mut dots);
+        dots
+    }
+    #[inline(always)]
+    fn spread(numbers: [Self; 8], rows: &mut [[LanesOf<N>; 8]]) {
+        <Self as Wide<LanesOf<N>>>::put_row(numbers, &mut rows[0]);
+    }
+    #[inline(always)]
+    fn collect(rows: &[[LanesOf<N>; 8]]) -> [Self; 8] {
+        <Self as Wide<LanesOf<N>>>::row(&rows[0])
+    }
+}
+
+/// [`Beside`] of plants side by side: eight, where there is AVX-512, or four.
+#[inline(always)]
+pub(crate) fn in_plants<T: Beside<LanesOf<N>>, const N: usize>(task: T) -> T::Output {
+    #[cfg(target_arch = "x86_64")]
+    {
+        #[target_feature(enable = "avx512f")]
+        fn eight<T: Beside<LanesOf<N>>, const N: usize>(task: T) -> T::Output {
+            task.run::<Sides<Whole, Whole>>()
+        }
+        #[target_feature(enable = "avx2")]
+        fn four<T: Beside<LanesOf<N>>, const N: usize>(task: T) -> T::Output {
+            task.run::<Sides<Low, Halves>>()
+        }
+        if N == 8 && has(AVX512) {
+            // SAFETY: the processor has AVX-512.
+            return unsafe { eight(task) };
+        }
+        if N == 4 && has(AVX2) {
+            // SAFETY: the processor has AVX2.
+            return unsafe { four(task) };
+        }
+    }
+    LanesOf::<N>::in_registers(|| task.run::<LanesOf<N>>())
+}
+
+/// [`Beside`] in the widest registers of the processor; a few of eight numbers are all there is.
+#[inline(always)]
+pub(crate) fn in_sides<T: Beside<f64>>(count: usize, task: T) -> T::Output {
+    #[cfg(target_arch = "x86_64")]
+    {
+        #[target_feature(enable = "avx512f")]
+        fn few_avx512<T: Beside<f64>>(task: T) -> T::Output {
+            task.run::<Sides<Low, Whole>>()
+        }
+        #[target_feature(enable = "avx2")]
+        fn few_avx2<T: Beside<f64>>(task: T) -> T::Output {
+            task.run::<Sides<Low, Halves>>()
+        }
+        if count <= FEW && has(AVX512) {
+            // SAFETY: the processor has AVX-512.
+            return unsafe { few_avx512(task) };
+        }
+        if count <= FEW && has(AVX2) {
+            // SAFETY: the processor has AVX2.
+            return unsafe { few_avx2(task) };
+        }
+    }
+    in_eights(InSides(task))
+}
+
+/// As many as lie in [`Low`].
+#[cfg(target_arch = "x86_64")]
+const FEW: usize = 4;
+
+/// [`Beside`] of eight numbers.
+struct InSides<T>(T);
+
+impl<T: Beside<f64>> InEights for InSides<T> {
+    type Output = T::Output;
+    #[inline(always)]
+    fn run<E: Eight>(self) -> T::Output {
+        self.0.run::<Sides<E, E>>()
+    }
+}
