@@ -3,7 +3,7 @@
 
 use crate::elimination::SymbolicElimination;
 use crate::rows::{LANES, Term, add_rows_portable, padded};
-use crate::scalar::{Compared, LanesOf, in_registers};
+use crate::scalar::{Beside, Compared, LanesOf, Scalar, Wide};
 use crate::simd::widest;
 
 /// A matrix that couples each row only with its ancestors, and its factorization in place.
@@ -41,6 +41,51 @@ impl<S: Compared> SmallestPivot<S> {
             self.row = row;
             self.relative = S::choose(is_smaller, relative, self.relative);
         }
+    }
+}
+
+/// What [`TreeLu::factor`] does.
+struct Factor<'a, S: Scalar> {
+    matrix: &'a mut TreeLu<S>,
+    elimination: &'a SymbolicElimination,
+    scale: &'a [f64],
+    factor: f64,
+}
+
+impl<S: Compared> Beside<S> for Factor<'_, S> {
+    type Output = SmallestPivot<S>;
+
+    #[inline(always)]
+    fn run<W: Wide<S>>(self) -> SmallestPivot<S> {
+        let Self { matrix, elimination, scale, factor } = self;
+        let TreeLu { upper, lower, inverse_pivot, reference, .. } = matrix;
+        for ((reference, end), scale) in
+            reference.iter_mut().zip(&elimination.offsets[1..]).zip(scale)
+        {
+            *reference = upper[end - 1].abs().max(S::constant(scale * factor));
+        }
+        let mut smallest = SmallestPivot::NONE;
+        for k in (0..elimination.rows()).rev() {
+            let start = elimination.offsets[k];
+            let ancestors = &elimination.ancestors[start..elimination.offsets[k + 1] - 1];
+            let depth = ancestors.len();
+            let (upper_above, upper_row) = upper.split_at_mut(start);
+            let (lower_above, lower_row) = lower.split_at_mut(start);
+            let pivot = upper_row[depth];
+            smallest.see(k, pivot, reference[k]);
+            let inverse = pivot.recip();
+            inverse_pivot[k] = inverse;
+            for entry in &mut upper_row[..depth] {
+                *entry = *entry * inverse;
+            }
+            for (d, &ancestor) in ancestors.iter().enumerate().rev() {
+                let target = elimination.offsets[ancestor];
+                let (l, u) = (lower_row[d], upper_row[d]);
+                W::subtract(l, &upper_row[..=d], &mut upper_above[target..=target + d]);
+                W::subtract(u, &lower_row[..d], &mut lower_above[target..target + d]);
+            }
+        }
+        smallest
     }
 }
 
@@ -85,41 +130,7 @@ impl<S: Compared> TreeLu<S> {
         scale: &[f64],
         factor: f64,
     ) -> SmallestPivot<S> {
-        in_registers!(S, {
-            for ((reference, end), scale) in
-                self.reference.iter_mut().zip(&elimination.offsets[1..]).zip(scale)
-            {
-                *reference = self.upper[end - 1].abs().max(S::constant(scale * factor));
-            }
-            let mut smallest = SmallestPivot::NONE;
-            for k in (0..elimination.rows()).rev() {
-                let start = elimination.offsets[k];
-                let ancestors = &elimination.ancestors[start..elimination.offsets[k + 1] - 1];
-                let depth = ancestors.len();
-                let (upper_above, upper_row) = self.upper.split_at_mut(start);
-                let (lower_above, lower_row) = self.lower.split_at_mut(start);
-                let pivot = upper_row[depth];
-                smallest.see(k, pivot, self.reference[k]);
-                let inverse = pivot.recip();
-                self.inverse_pivot[k] = inverse;
-                for entry in &mut upper_row[..depth] {
-                    *entry = *entry * inverse;
-                }
-                for (d, &ancestor) in ancestors.iter().enumerate().rev() {
-                    let target = elimination.offsets[ancestor];
-                    let (l, u) = (lower_row[d], upper_row[d]);
-                    let upper_target = &mut upper_above[target..=target + d];
-                    for (t, s) in upper_target.iter_mut().zip(&upper_row[..=d]) {
-                        *t -= l * *s;
-                    }
-                    let lower_target = &mut lower_above[target..target + d];
-                    for (t, s) in lower_target.iter_mut().zip(&lower_row[..d]) {
-                        *t -= u * *s;
-                    }
-                }
-            }
-            smallest
-        })
+        S::beside(elimination.rows(), Factor { matrix: self, elimination, scale, factor })
     }
 
     /// Solves `K x = b` in place.

@@ -39,6 +39,8 @@ pub trait Wide<S: Scalar>: Scalar {
     fn dot_of(a: Self::Line, b: Self::Line) -> S;
     /// The sum of the products of two lines, and of two more.
     fn dots(a: [Self::Line; 2], b: [Self::Line; 2]) -> S;
+    /// Subtracts from each number of a list that of another one, times a factor.
+    fn subtract(factor: S, source: &[S], target: &mut [S]);
     /// Three numbers that belong together.
     type Triple: Copy;
     /// From memory.
@@ -70,6 +72,12 @@ macro_rules! alone {
     ([$($generic:tt)*] $type:ty) => {
         impl<$($generic)*> Wide<Self> for $type {
             type Line = [Self; 8];
+            #[inline(always)]
+            fn subtract(factor: Self, source: &[Self], target: &mut [Self]) {
+                for (t, s) in target.iter_mut().zip(source) {
+                    *t -= factor * *s;
+                }
+            }
             type Triple = [Self; 3];
             #[inline(always)]
             fn triple(numbers: &[Self; 3]) -> [Self; 3] {
@@ -305,6 +313,12 @@ impl<E: Eight, L: Eight> Wide<f64> for Sides<E, L> {
         Self::new(E::all(*number))
     }
     type Line = L;
+    #[inline(always)]
+    fn subtract(factor: f64, source: &[f64], target: &mut [f64]) {
+        for (t, s) in target.iter_mut().zip(source) {
+            *t -= factor * *s;
+        }
+    }
     type Triple = L::Four;
     #[inline(always)]
     fn triple([x, y, z]: &[f64; 3]) -> L::Four {
@@ -369,6 +383,14 @@ impl<E: Eight, L: Eight> Wide<f64> for Sides<E, L> {
 /// Of plants side by side.
 impl<E: Eight, L: Eight, const N: usize> Wide<LanesOf<N>> for Sides<E, L> {
     type Line = [Self; 8];
+    #[inline(always)]
+    fn subtract(factor: LanesOf<N>, source: &[LanesOf<N>], target: &mut [LanesOf<N>]) {
+        let factor = E::of_list(&factor.0);
+        for (t, s) in target.iter_mut().zip(source) {
+            let product = factor.times(E::of_list(&s.0));
+            E::of_list(&t.0).minus(product).put_list(&mut t.0);
+        }
+    }
     type Triple = [Self; 3];
     #[inline(always)]
     fn triple([x, y, z]: &[LanesOf<N>; 3]) -> [Self; 3] {
