@@ -53,6 +53,46 @@ macro_rules! operators {
 }
 pub(crate) use operators;
 
+/// What [`Scalar`] says of numbers side by side, of a type that has none.
+macro_rules! nothing_beside {
+    () => {
+        type Several = Self;
+        type Row = [Self; 8];
+        const BESIDE: usize = 1;
+        #[inline(always)]
+        fn several(of: impl Fn(usize) -> Self) -> Self {
+            of(0)
+        }
+        #[inline(always)]
+        fn one(several: &Self, _: usize) -> Self {
+            *several
+        }
+        #[inline(always)]
+        fn put(self, several: &mut Self, _: usize) {
+            *several = self;
+        }
+        #[inline(always)]
+        fn entry(row: &[Self; 8], k: usize) -> Self {
+            row[k]
+        }
+        #[inline(always)]
+        fn dot(a: &[Self; 8], b: &[Self; 8]) -> Self {
+            let mut products = *a;
+            for (product, b) in products.iter_mut().zip(b) {
+                *product = *product * *b;
+            }
+            sum_of_eight(products)
+        }
+        #[inline(always)]
+        fn dot_of_six(a: &[Self; 8], b: &[Self; 8]) -> Self {
+            let product = |k: usize| a[k] * b[k];
+            let half = |k: usize| product(k) + product(k + 4);
+            (half(0) + product(2)) + (half(1) + product(3))
+        }
+    };
+}
+pub(crate) use nothing_beside;
+
 /// [`wide!`] in registers as wide as suits a type of numbers ([`Scalar::in_registers`]).
 #[macro_export]
 macro_rules! in_registers {
@@ -232,39 +272,7 @@ impl<S: Scalar> Dual<S> {
 }
 
 impl<S: Scalar> Scalar for Dual<S> {
-    type Several = Self;
-    type Row = [Self; 8];
-    const BESIDE: usize = 1;
-    #[inline(always)]
-    fn several(of: impl Fn(usize) -> Self) -> Self {
-        of(0)
-    }
-    #[inline(always)]
-    fn one(several: &Self, _: usize) -> Self {
-        *several
-    }
-    #[inline(always)]
-    fn put(self, several: &mut Self, _: usize) {
-        *several = self;
-    }
-    #[inline(always)]
-    fn entry(row: &[Self; 8], k: usize) -> Self {
-        row[k]
-    }
-    #[inline(always)]
-    fn dot(a: &[Self; 8], b: &[Self; 8]) -> Self {
-        let mut products = *a;
-        for (product, b) in products.iter_mut().zip(b) {
-            *product = *product * *b;
-        }
-        sum_of_eight(products)
-    }
-    #[inline(always)]
-    fn dot_of_six(a: &[Self; 8], b: &[Self; 8]) -> Self {
-        let product = |k: usize| a[k] * b[k];
-        let half = |k: usize| product(k) + product(k + 4);
-        (half(0) + product(2)) + (half(1) + product(3))
-    }
+    nothing_beside! {}
     #[inline(always)]
     fn beside<T: Beside<Self>>(_: usize, task: T) -> T::Output {
         Self::in_registers(|| task.run::<Self>())
@@ -386,39 +394,7 @@ impl<const N: usize> LanesOf<N> {
 }
 
 impl<const N: usize> Scalar for LanesOf<N> {
-    type Several = Self;
-    type Row = [Self; 8];
-    const BESIDE: usize = 1;
-    #[inline(always)]
-    fn several(of: impl Fn(usize) -> Self) -> Self {
-        of(0)
-    }
-    #[inline(always)]
-    fn one(several: &Self, _: usize) -> Self {
-        *several
-    }
-    #[inline(always)]
-    fn put(self, several: &mut Self, _: usize) {
-        *several = self;
-    }
-    #[inline(always)]
-    fn entry(row: &[Self; 8], k: usize) -> Self {
-        row[k]
-    }
-    #[inline(always)]
-    fn dot(a: &[Self; 8], b: &[Self; 8]) -> Self {
-        let mut products = *a;
-        for (product, b) in products.iter_mut().zip(b) {
-            *product = *product * *b;
-        }
-        sum_of_eight(products)
-    }
-    #[inline(always)]
-    fn dot_of_six(a: &[Self; 8], b: &[Self; 8]) -> Self {
-        let product = |k: usize| a[k] * b[k];
-        let half = |k: usize| product(k) + product(k + 4);
-        (half(0) + product(2)) + (half(1) + product(3))
-    }
+    nothing_beside! {}
     #[inline(always)]
     fn beside<T: Beside<Self>>(_: usize, task: T) -> T::Output {
         in_plants(task)

@@ -1,7 +1,7 @@
 //! The Lagrangian `L(q, v) = T(q, v) − V(q)` of a tree of rigid bodies, and generalized forces `f(q, v, u)`.
 //!
 //! [`mechanics`] gives `L_q` and `L_v` of one model, in space from [`kinematics`], [`momenta`] and
-//! [`curvature`], in planes from [`planar`]; [`derivatives`] has the second derivatives and those of forces as
+//! [`curvature`], which add up along the tree by [`sums`], in planes from [`planar`]; [`derivatives`] has the second derivatives and those of forces as
 //! matrices. Each potential is a file in [`potentials`], each force a file in [`forces`].
 
 pub(crate) mod armature;

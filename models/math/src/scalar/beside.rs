@@ -11,7 +11,7 @@ use std::ops::{Add, AddAssign, Mul, Neg, Sub, SubAssign};
 use crate::eights::registers::{Halves, Low, Whole};
 use crate::eights::{Eight, InEights, in_eights};
 use crate::rows::{Block, sum_of_eight};
-use crate::scalar::{Dual, LanesOf, Scalar, operators};
+use crate::scalar::{Dual, LanesOf, Scalar, nothing_beside, operators};
 #[cfg(target_arch = "x86_64")]
 use crate::simd::{AVX2, AVX512, has};
 
@@ -228,42 +228,10 @@ operators! { [E: Eight, L: Eight] Sides<E, L>;
 }
 
 impl<E: Eight, L: Eight> Scalar for Sides<E, L> {
-    type Several = Self;
-    type Row = [Self; 8];
-    const BESIDE: usize = 1;
+    nothing_beside! {}
     const ZERO: Self = Self(E::ZERO, PhantomData);
     const ONE: Self = Self(E::ONE, PhantomData);
     const IS_SEVERAL: bool = true;
-    #[inline(always)]
-    fn several(of: impl Fn(usize) -> Self) -> Self {
-        of(0)
-    }
-    #[inline(always)]
-    fn one(several: &Self, _: usize) -> Self {
-        *several
-    }
-    #[inline(always)]
-    fn put(self, several: &mut Self, _: usize) {
-        *several = self;
-    }
-    #[inline(always)]
-    fn entry(row: &[Self; 8], k: usize) -> Self {
-        row[k]
-    }
-    #[inline(always)]
-    fn dot(a: &[Self; 8], b: &[Self; 8]) -> Self {
-        let mut products = *a;
-        for (product, b) in products.iter_mut().zip(b) {
-            *product = *product * *b;
-        }
-        sum_of_eight(products)
-    }
-    #[inline(always)]
-    fn dot_of_six(a: &[Self; 8], b: &[Self; 8]) -> Self {
-        let product = |k: usize| a[k] * b[k];
-        let half = |k: usize| product(k) + product(k + 4);
-        (half(0) + product(2)) + (half(1) + product(3))
-    }
     #[inline(always)]
     fn beside<T: Beside<Self>>(_: usize, task: T) -> T::Output {
         task.run::<Self>()
