@@ -5,7 +5,7 @@
 //! All kinds do the same operations in the same order: the bits are the same.
 
 #[cfg(target_arch = "x86_64")]
-pub(crate) mod registers;
+mod registers;
 
 #[cfg(target_arch = "x86_64")]
 use crate::eights::registers::{Halves, Whole};
@@ -22,9 +22,15 @@ pub trait Eight: Copy + 'static {
     /// Ones.
     const ONE: Self;
     /// From memory.
-    fn of(block: &Block) -> Self;
+    #[inline(always)]
+    fn of(block: &Block) -> Self {
+        Self::of_list(&block.0)
+    }
     /// To memory.
-    fn put(self, block: &mut Block);
+    #[inline(always)]
+    fn put(self, block: &mut Block) {
+        self.put_list(&mut block.0);
+    }
     /// From a list of at least as many numbers as are of use.
     fn of_list(list: &[f64]) -> Self;
     /// To a list of at least as many.
@@ -81,6 +87,7 @@ pub trait InEights {
     /// Does it. Always inlined, as is all that works on these numbers in it.
     fn run<E: Eight>(self) -> Self::Output;
 }
+
 /// Does it in the widest registers of the processor.
 #[inline(always)]
 pub fn in_eights<T: InEights>(task: T) -> T::Output {
@@ -111,10 +118,6 @@ impl Eight for Block {
     const ZERO: Self = Self([0.0; 8]);
     const ONE: Self = Self([1.0; 8]);
     #[inline(always)]
-    fn of(block: &Block) -> Self {
-        *block
-    }
-    #[inline(always)]
     fn of_list(list: &[f64]) -> Self {
         let mut block = Self::ZERO;
         block.0.iter_mut().zip(list).for_each(|(own, number)| *own = *number);
@@ -123,10 +126,6 @@ impl Eight for Block {
     #[inline(always)]
     fn put_list(self, list: &mut [f64]) {
         list.iter_mut().zip(self.0).for_each(|(number, own)| *number = own);
-    }
-    #[inline(always)]
-    fn put(self, block: &mut Block) {
-        *block = self;
     }
     #[inline(always)]
     fn all(number: f64) -> Self {

@@ -53,7 +53,6 @@ struct Group {
     axes: Range<usize>,
     /// The orientation of a ball joint.
     ball: Option<usize>,
-    is_root: bool,
 }
 
 /// Groups one below the other, with nothing beside them.
@@ -212,9 +211,6 @@ fn limbs(tree: &Tree) -> (Vec<Limb>, Vec<Group>, usize) {
         let parent = joints[top].parent;
         let begin = groups.len();
         gather(tree, top..end, &mut groups);
-        if let (Some(last), None) = (groups.last_mut(), children.get(parent)) {
-            last.is_root = true;
-        }
         limbs.push(Limb {
             groups: begin..groups.len(),
             carries: (children[lowest] > 1).then_some(forks[lowest]),
@@ -230,13 +226,12 @@ fn limbs(tree: &Tree) -> (Vec<Limb>, Vec<Group>, usize) {
 
 /// Groups of axes one below the other, the lowest first; as few as can be, and of like sizes.
 fn gather(tree: &Tree, axes: Range<usize>, groups: &mut Vec<Group>) {
-    let is_root = false;
     let mut end = axes.end;
     while end > axes.start {
         if let JointKind::Ball(axis) = tree.joints[end - 1].kind {
             let start = end - 1 - axis;
             let ball = Some(tree.joints[start].orientation);
-            groups.push(Group { axes: start..end, ball, is_root });
+            groups.push(Group { axes: start..end, ball });
             end = start;
             continue;
         }
@@ -244,7 +239,7 @@ fn gather(tree: &Tree, axes: Range<usize>, groups: &mut Vec<Group>) {
         let start = (axes.start..end).rev().find(is_ball).map_or(axes.start, |i| i + 1);
         for left in (1..=(end - start).div_ceil(WIDEST)).rev() {
             let width = (end - start).div_ceil(left);
-            groups.push(Group { axes: end - width..end, ball: None, is_root });
+            groups.push(Group { axes: end - width..end, ball: None });
             end -= width;
         }
     }
@@ -352,7 +347,8 @@ impl SpatialRecursion {
                 let see = |axis: usize, pivot: f64, entry: f64| {
                     smallest.see(first + axis, pivot, entry.abs().max(inertia(first + axis)));
                 };
-                let (is_root, sums) = (group.is_root, &mut sums);
+                let is_root = limb.hangs_from.is_none() && at + 1 == limb.groups.end;
+                let sums = &mut sums;
                 match &mut self.axes[group.axes.clone()] {
                     [a] => eliminate([a], within, sums, carries, is_root, see),
                     [a, b] => eliminate([a, b], within, sums, carries, is_root, see),

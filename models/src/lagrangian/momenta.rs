@@ -78,7 +78,7 @@ impl<S: Scalar> Beside<S> for Gradient<'_, S> {
 
 /// Numbers of the joints that begin with `i`, from a list of those of coordinates; zero beyond the list.
 #[inline(always)]
-pub(crate) fn collect<S: Scalar, W: Wide<S>>(tree: &Tree, i: usize, list: &[S]) -> W {
+fn collect<S: Scalar, W: Wide<S>>(tree: &Tree, i: usize, list: &[S]) -> W {
     let mut several = S::Several::default();
     for (lane, joint) in tree.joints[i..].iter().take(S::BESIDE).enumerate() {
         if let Some(number) = list.get(joint.coordinate) {
@@ -90,7 +90,7 @@ pub(crate) fn collect<S: Scalar, W: Wide<S>>(tree: &Tree, i: usize, list: &[S]) 
 
 /// The way back, but for what is beyond the list.
 #[inline(always)]
-pub(crate) fn scatter<S: Scalar, W: Wide<S>>(tree: &Tree, i: usize, wide: W, list: &mut [S]) {
+fn scatter<S: Scalar, W: Wide<S>>(tree: &Tree, i: usize, wide: W, list: &mut [S]) {
     let mut several = S::Several::default();
     wide.store(&mut several);
     for (lane, joint) in tree.joints[i..].iter().take(S::BESIDE).enumerate() {

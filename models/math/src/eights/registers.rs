@@ -8,29 +8,21 @@ use crate::rows::Block;
 
 /// A register of eight numbers, of AVX-512.
 #[derive(Clone, Copy)]
-pub(crate) struct Whole(__m512d);
+pub(super) struct Whole(__m512d);
 
 /// Two registers of four numbers, of AVX2.
 #[derive(Clone, Copy)]
-pub(crate) struct Halves([Low; 2]);
+pub(super) struct Halves([Low; 2]);
 
 /// The first four of eight numbers, where the others are of no use: a register of AVX2.
 #[derive(Clone, Copy)]
-pub(crate) struct Low(__m256d);
+pub(super) struct Low(__m256d);
 
 /// What is done number by number in one register.
 macro_rules! number_by_number {
     ($numbers:literal, $load:ident, $store:ident, $all:ident, $plus:ident, $minus:ident, $times:ident) => {
         const ZERO: Self = Self::constant(0.0);
         const ONE: Self = Self::constant(1.0);
-        #[inline(always)]
-        fn of(block: &Block) -> Self {
-            Self::of_list(&block.0)
-        }
-        #[inline(always)]
-        fn put(self, block: &mut Block) {
-            self.put_list(&mut block.0);
-        }
         #[inline(always)]
         fn of_list(list: &[f64]) -> Self {
             // SAFETY: there are such registers, and as many numbers.
@@ -181,14 +173,6 @@ impl Eight for Halves {
     type Four = Low;
     const ZERO: Self = Self([Low::ZERO; 2]);
     const ONE: Self = Self([Low::ONE; 2]);
-    #[inline(always)]
-    fn of(block: &Block) -> Self {
-        Self::of_list(&block.0)
-    }
-    #[inline(always)]
-    fn put(self, block: &mut Block) {
-        self.put_list(&mut block.0);
-    }
     #[inline(always)]
     fn of_list(list: &[f64]) -> Self {
         Self([Low::of_list(list), Low::of_list(&list[4..])])

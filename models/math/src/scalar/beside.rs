@@ -7,13 +7,9 @@ use std::fmt::{self, Debug, Formatter};
 use std::marker::PhantomData;
 use std::ops::{Add, AddAssign, Mul, Neg, Sub, SubAssign};
 
-#[cfg(target_arch = "x86_64")]
-use crate::eights::registers::{Halves, Low, Whole};
 use crate::eights::{Eight, InEights, in_eights};
 use crate::rows::{Block, sum_of_eight};
 use crate::scalar::{Dual, LanesOf, Scalar, nothing_beside, operators};
-#[cfg(target_arch = "x86_64")]
-use crate::simd::{AVX2, AVX512, has};
 
 /// Numbers side by side in registers, of which [`Scalar::Several`] lie in memory.
 pub trait Wide<S: Scalar>: Scalar {
@@ -442,67 +438,55 @@ impl<E: Eight, L: Eight, const N: usize> Wide<LanesOf<N>> for Sides<E, L> {
     }
 }
 
-/// [`Beside`] of plants side by side: eight, where there is AVX-512, or four.
+/// [`Beside`] of plants side by side: eight or four, in registers.
 #[inline(always)]
 pub(crate) fn in_plants<T: Beside<LanesOf<N>>, const N: usize>(task: T) -> T::Output {
-    #[cfg(target_arch = "x86_64")]
-    {
-        #[target_feature(enable = "avx512f")]
-        fn eight<T: Beside<LanesOf<N>>, const N: usize>(task: T) -> T::Output {
-            task.run::<Sides<Whole, Whole>>()
-        }
-        #[target_feature(enable = "avx2")]
-        fn four<T: Beside<LanesOf<N>>, const N: usize>(task: T) -> T::Output {
-            task.run::<Sides<Low, Halves>>()
-        }
-        if N == 8 && has(AVX512) {
-            // SAFETY: the processor has AVX-512.
-            return unsafe { eight(task) };
-        }
-        if N == 4 && has(AVX2) {
-            // SAFETY: the processor has AVX2.
-            return unsafe { four(task) };
-        }
+    match N {
+        8 => in_eights(InEight(task, PhantomData)),
+        4 => in_eights(InFour(task, PhantomData)),
+        _ => LanesOf::<N>::in_registers(|| task.run::<LanesOf<N>>()),
     }
-    LanesOf::<N>::in_registers(|| task.run::<LanesOf<N>>())
 }
 
-/// [`Beside`] in the widest registers of the processor; a few of eight numbers are all there is.
+/// [`Beside`] of reals: of eight, or, where a few are all there are, of four.
 #[inline(always)]
 pub(crate) fn in_sides<T: Beside<f64>>(count: usize, task: T) -> T::Output {
-    #[cfg(target_arch = "x86_64")]
-    {
-        #[target_feature(enable = "avx512f")]
-        fn few_avx512<T: Beside<f64>>(task: T) -> T::Output {
-            task.run::<Sides<Low, Whole>>()
-        }
-        #[target_feature(enable = "avx2")]
-        fn few_avx2<T: Beside<f64>>(task: T) -> T::Output {
-            task.run::<Sides<Low, Halves>>()
-        }
-        if count <= FEW && has(AVX512) {
-            // SAFETY: the processor has AVX-512.
-            return unsafe { few_avx512(task) };
-        }
-        if count <= FEW && has(AVX2) {
-            // SAFETY: the processor has AVX2.
-            return unsafe { few_avx2(task) };
-        }
+    if count <= FEW {
+        in_eights(InFour(task, PhantomData))
+    } else {
+        in_eights(InEight(task, PhantomData))
     }
-    in_eights(InSides(task))
 }
 
-/// As many as lie in [`Low`].
-#[cfg(target_arch = "x86_64")]
+/// As many as lie in [`Eight::Four`].
 const FEW: usize = 4;
 
 /// [`Beside`] of eight numbers.
-struct InSides<T>(T);
+struct InEight<S, T>(T, PhantomData<S>);
 
-impl<T: Beside<f64>> InEights for InSides<T> {
-    type Output = T::Output;
-    #[inline(always)]
-    fn run<E: Eight>(self) -> T::Output {
-        self.0.run::<Sides<E, E>>()
-    }
+/// [`Beside`] of four numbers.
+struct InFour<S, T>(T, PhantomData<S>);
+
+/// Both, of reals and of plants.
+macro_rules! in_eights_of {
+    ([$($generic:tt)*] $number:ty) => {
+        impl<T: Beside<$number>, $($generic)*> InEights for InEight<$number, T> {
+            type Output = T::Output;
+            #[inline(always)]
+            fn run<E: Eight>(self) -> T::Output {
+                self.0.run::<Sides<E, E>>()
+            }
+        }
+
+        impl<T: Beside<$number>, $($generic)*> InEights for InFour<$number, T> {
+            type Output = T::Output;
+            #[inline(always)]
+            fn run<E: Eight>(self) -> T::Output {
+                self.0.run::<Sides<E::Four, E>>()
+            }
+        }
+    };
 }
+
+in_eights_of! { [] f64 }
+in_eights_of! { [const N: usize] LanesOf<N> }
