@@ -10,19 +10,21 @@
 //! ```
 //!
 //! joint `j` adds `plus_j x_j` to `ξ` and `s_j x_j` to `ω` of what it carries; it feels `minus_j·φ + s_j·ψ`
-//! ([`PlanarRecursion`] is the same without loops). A closure measures `e·ω` of its two bodies and pushes them by
+//! ([`PlanarRecursion`](crate::kkt::planar::PlanarRecursion) is the same without loops). A closure measures `e·ω` of its two bodies and pushes them by
 //! `ψ −= e λ`. What is eliminated is summed in a front, `[φ ψ 0] = A [ξ ω λ]`, with one row for each equation
 //! that is still open; a pivot takes the product of a column and a row away from it.
 
 mod column;
 
+use plantd_math::eights::{Eight, InEights, in_eights};
 use plantd_math::rows::{Block, LANES, padded};
 use plantd_math::simd::widest;
 use plantd_math::tree_lu::SmallestPivot;
 
 use crate::constraints::in_plane::InPlane;
 use crate::kkt::loops::column::Column;
-use crate::kkt::planar::{Diagonal, Method, PlanarRecursion, add_to, dot3, product};
+use crate::kkt::planar::columns::Columns;
+use crate::kkt::planar::{Diagonal, Method, dot3};
 use crate::lagrangian::arrangement::Fours;
 use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::planar::Joints;
@@ -63,7 +65,7 @@ struct Closed {
 /// The KKT matrix of a mechanism with loops, factored front by front.
 #[derive(Clone, Debug)]
 pub(crate) struct Multifrontal {
-    tree: PlanarRecursion,
+    columns: Columns,
     fronts: Vec<f64>,
     factored: Factored,
     /// What passes through the rows of fronts, and multipliers, of one right-hand side.
@@ -251,7 +253,7 @@ impl Multifrontal {
         let factors = loops.plan.steps.iter();
         let factors = factors.map(|s| 2 * shapes[s.front].stride * (1 + s.closed.len())).sum();
         Self {
-            tree: PlanarRecursion::new(joints),
+            columns: Columns::new(joints),
             fronts: vec![0.0; entry],
             factored: Factored {
                 shapes,
@@ -283,7 +285,7 @@ impl Multifrontal {
         widest!({
             let Mechanism { loops, joints, tree, start, end } = at;
             let method = Method::new(time_step_s, kind);
-            self.tree.step = time_step_s;
+            self.columns.step = time_step_s;
             self.fronts.fill(0.0);
             let mut pivots = Pivots { joints: SmallestPivot::NONE, equations: 1.0, steepness: 1.0 };
             let Factored { shapes, pivots: eliminated, closed, factors } = &mut self.factored;
@@ -379,9 +381,8 @@ impl Multifrontal {
         })
     }
 
-    /// As [`PlanarRecursion::linearize`], with multipliers. About `8 m` flops for each joint or equation
+    /// As without loops, with multipliers. About `8 m` flops for each joint or equation
     /// and column beside those of a tree.
-    #[inline(never)]
     pub(crate) fn linearize(
         &mut self,
         at: Mechanism<'_>,
@@ -389,71 +390,95 @@ impl Multifrontal {
         closures: &Closures<'_>,
         out: Derivatives<'_>,
     ) {
-        widest!({
-            let Mechanism { loops, joints, tree, start, .. } = at;
-            let (n, stride) = (joints.len(), out.stride);
-            out.multipliers.fill(0.0);
-            self.tree.find_slopes(tree, joints);
-            for first in (0..stride).step_by(LANES) {
-                self.tree.start_columns(tree, joints, diagonal, first);
-                let columns = first..n.min(first + LANES);
-                let PlanarRecursion { increment, momentum, .. } = &mut self.tree;
-                for (i, (x, p)) in increment.iter_mut().zip(momentum).enumerate() {
-                    if first < n {
-                        let row = &closures.hessian[i * n..][columns.clone()];
-                        for (lane, value) in row.iter().enumerate() {
-                            x.0[lane] -= value;
-                            p.0[lane] -= value;
-                        }
-                    }
-                    *x = x.times(-1.0);
-                }
-                for (side, equation) in self.block_sides.iter_mut().zip(&loops.equations) {
-                    *side = Block::ZERO;
-                    if first < n {
-                        let row = &closures.jacobian[equation.constraint * n..][columns.clone()];
-                        side.0.iter_mut().zip(row).for_each(|(to, from)| *to = -from);
-                    }
-                }
-                let Self { factored, block_sides: sides, block_flows: flows, .. } = self;
-                let (x, multipliers) = (&mut self.tree.increment, &mut self.block_multipliers);
-                factored.eliminate(loops, x, sides, multipliers, flows);
-                factored.substitute(loops, x, multipliers, flows);
-                self.tree.carry_down(joints, diagonal);
-                self.tree.gather(joints);
-                self.push_back(loops, joints, start);
-                self.tree.write_columns(out.increment, out.momentum, first, stride);
-                for (value, equation) in self.block_multipliers.iter().zip(&loops.equations) {
-                    let row = &mut out.multipliers[equation.constraint * stride..][..stride];
-                    row[first..][..LANES].copy_from_slice(&value.0);
-                }
+        in_eights(Linearize { multifrontal: self, at, diagonal, closures, out });
+    }
+
+    /// Takes what turns constraints from a block of columns, turns that round, and fills their sides.
+    #[inline(always)]
+    fn add_closures<E: Eight>(&mut self, loops: &Loops, closures: &Closures<'_>, first: usize) {
+        let n = self.columns.increment.len();
+        let columns = first.min(n)..n.min(first + LANES);
+        let Columns { increment, momentum, .. } = &mut self.columns;
+        for (i, (x, p)) in increment.iter_mut().zip(momentum).enumerate() {
+            let row = &closures.hessian[i * n..][columns.clone()];
+            for (lane, value) in row.iter().enumerate() {
+                x.0[lane] -= value;
+                p.0[lane] -= value;
             }
-        })
+            E::of(x).scaled(-1.0).put(x);
+        }
+        for (side, equation) in self.block_sides.iter_mut().zip(&loops.equations) {
+            *side = Block::ZERO;
+            let row = &closures.jacobian[equation.constraint * n..][columns.clone()];
+            side.0.iter_mut().zip(row).for_each(|(to, from)| *to = -from);
+        }
     }
 
     /// From the leaves to the root: what multipliers take from the momentum.
     #[inline(always)]
-    fn push_back(&mut self, loops: &Loops, joints: &[PlanarJoint], start: &InPlane) {
+    fn push_back<E: Eight>(&mut self, loops: &Loops, joints: &[PlanarJoint], start: &InPlane) {
+        let add = |to: &mut Block, part: E| E::of(to).plus(part).put(to);
         for ((equation, wrenches), lambda) in
             loops.equations.iter().zip(&start.wrenches).zip(&self.block_multipliers)
         {
+            let lambda = E::of(lambda);
             for (body, wrench) in equation.bodies.iter().zip(wrenches) {
                 if let Some(body) = body {
-                    let [n, fx, fy] = *wrench;
-                    let push = [lambda.times(-n), lambda.times(-fx), lambda.times(-fy)];
-                    add_to(&mut self.wrenches[body + 1], push);
+                    for (to, part) in self.wrenches[body + 1].iter_mut().zip(wrench) {
+                        add(to, lambda.scaled(-part));
+                    }
                 }
             }
         }
         for (i, joint) in joints.iter().enumerate().rev() {
             let [n, fx, fy] = std::mem::replace(&mut self.wrenches[i + 1], [Block::ZERO; 3]);
+            let [n, fx, fy] = [E::of(&n), E::of(&fx), E::of(&fy)];
             let ([dx, dy], [ex, ey]) = (start.slide[i], start.edge[i]);
-            let momentum = &mut self.tree.momentum[i];
-            *momentum = momentum.plus(product([joint.body.turn, dx, dy], [n, fx, fy]));
-            let moved = n.plus(fy.times(ex)).plus(fx.times(-ey));
-            add_to(&mut self.wrenches[joint.parent], [moved, fx, fy]);
+            let torque = n.scaled(joint.body.turn).plus(fx.scaled(dx)).plus(fy.scaled(dy));
+            add(&mut self.columns.momentum[i], torque);
+            let moved = n.plus(fy.scaled(ex)).plus(fx.scaled(-ey));
+            for (to, part) in self.wrenches[joint.parent].iter_mut().zip([moved, fx, fy]) {
+                add(to, part);
+            }
         }
         self.wrenches[0] = [Block::ZERO; 3];
+    }
+}
+
+struct Linearize<'a> {
+    multifrontal: &'a mut Multifrontal,
+    at: Mechanism<'a>,
+    diagonal: &'a Diagonal<'a>,
+    closures: &'a Closures<'a>,
+    out: Derivatives<'a>,
+}
+
+impl InEights for Linearize<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<E: Eight>(self) {
+        let Self { multifrontal: own, at, diagonal, closures, out } = self;
+        let Mechanism { loops, joints, tree, start, .. } = at;
+        let stride = out.stride;
+        out.multipliers.fill(0.0);
+        own.columns.find_slopes(tree, joints);
+        for first in (0..stride).step_by(LANES) {
+            own.columns.start::<E>(tree, joints, diagonal, first);
+            own.add_closures::<E>(loops, closures, first);
+            let Multifrontal { factored, block_sides: sides, block_flows: flows, .. } = own;
+            let (x, multipliers) = (&mut own.columns.increment, &mut own.block_multipliers);
+            factored.eliminate(loops, x, sides, multipliers, flows);
+            factored.substitute(loops, x, multipliers, flows);
+            own.columns.carry_down::<E>(joints, diagonal);
+            own.columns.gather::<E>(joints);
+            own.push_back::<E>(loops, joints, start);
+            own.columns.write::<E>(out.increment, out.momentum, first, stride);
+            for (value, equation) in own.block_multipliers.iter().zip(&loops.equations) {
+                let row = &mut out.multipliers[equation.constraint * stride..][..stride];
+                E::of(value).put_list(&mut row[first..][..LANES]);
+            }
+        }
     }
 }
 

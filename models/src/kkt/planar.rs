@@ -21,15 +21,18 @@
 //! the leaves to the root are `D_j`. As each sum is about its own
 //! joint, long chains lose no digits.
 
-use plantd_math::rows::{Block, LANES};
+pub(super) mod columns;
+
+use plantd_math::eights::{Eight, InEights, in_eights};
+use plantd_math::rows::LANES;
 use plantd_math::scalar::{Compared, Scalar, in_registers};
-use plantd_math::simd::widest;
 use plantd_math::tree_lu::SmallestPivot;
 
+use crate::kkt::planar::columns::Columns;
 use crate::lagrangian::arrangement::{Fours, Planar};
 use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::planar::{Joints, Link};
-use crate::lagrangian::plane::{Vec2, Vec3, cross, dot, linear};
+use crate::lagrangian::plane::{Vec3, cross, linear};
 use crate::model::planar_tree::PlanarJoint;
 
 /// What a joint gives to the matrix, and what is left of it when it has been eliminated.
@@ -38,17 +41,6 @@ pub(super) struct Generator<S = f64> {
     pub(super) minus: Vec3<S>,
     pub(super) plus: Vec3<S>,
     inverse_d: S,
-}
-
-/// What a joint gives to the derivative of the momentum.
-#[derive(Clone, Copy, Debug, Default)]
-struct Slope {
-    edge: Vec2,
-    plus: Vec3,
-    /// `P + ½h γ e`, and linear parts of `½h P + F`, after `½h γ`, and of `J̇`.
-    slope: Vec3,
-    push: Vec3,
-    rate: Vec2,
 }
 
 /// How right-hand sides pass a joint when it has been eliminated: what is below reaches the parent as
@@ -125,15 +117,7 @@ pub(crate) struct Elimination<S = f64> {
 #[derive(Clone, Debug)]
 pub(crate) struct PlanarRecursion {
     pub(crate) elimination: Elimination,
-    slopes: Vec<Slope>,
-    pub(super) step: f64,
-    /// Both for a block of right-hand sides; the first is that of the world. What goes up is zero but within a
-    /// pass.
-    flows: Vec<[Block; 3]>,
-    motions: Vec<[Block; 3]>,
-    /// A block of columns of the derivatives.
-    pub(super) increment: Vec<Block>,
-    pub(super) momentum: Vec<Block>,
+    columns: Columns,
 }
 
 #[inline(always)]
@@ -334,15 +318,7 @@ impl<S: Planar> Elimination<S> {
 
 impl PlanarRecursion {
     pub(crate) fn new(joints: usize) -> Self {
-        Self {
-            elimination: Elimination::new(joints),
-            slopes: vec![Slope::default(); joints],
-            step: 0.0,
-            flows: vec![[Block::ZERO; 3]; joints + 1],
-            motions: vec![[Block::ZERO; 3]; joints + 1],
-            increment: vec![Block::ZERO; joints],
-            momentum: vec![Block::ZERO; joints],
-        }
+        Self { elimination: Elimination::new(joints), columns: Columns::new(joints) }
     }
 
     /// [`Elimination::factor`], for a linearization, too.
@@ -355,16 +331,15 @@ impl PlanarRecursion {
         step: f64,
         kind: MatrixKind,
     ) -> SmallestPivot {
-        self.step = step;
+        self.columns.step = step;
         self.elimination.factor(tree, joints, diagonal, inertia, step, kind)
     }
 
     /// Writes the derivatives of the increment, `X = −K⁻¹ [G 1]` with `G = ½h L_qq − L_vq`, and of the
     /// momentum, `[h L_qq 1] + (½h L_qq + L_qv) X`, by configuration and momentum; springs and dampers
     /// of coordinates are added by `diagonal`s. Rows are those of coordinates, `stride` apart and whole
-    /// blocks. Four passes over the joints for each block of columns, about 95 flops a joint and
+    /// blocks. Five passes over the joints for each block of columns, about 95 flops a joint and
     /// column.
-    #[inline(never)]
     pub(crate) fn linearize(
         &mut self,
         tree: &Joints<Fours>,
@@ -374,203 +349,36 @@ impl PlanarRecursion {
         momentum: &mut [f64],
         stride: usize,
     ) {
-        widest!({
-            self.find_slopes(tree, joints);
-            for first in (0..stride).step_by(LANES) {
-                self.start_columns(tree, joints, diagonal, first);
-                self.eliminate(joints);
-                self.substitute(joints, diagonal);
-                self.gather(joints);
-                self.write_columns(increment, momentum, first, stride);
-            }
-        })
-    }
-
-    /// At the second derivatives of the last factorization.
-    #[inline(always)]
-    pub(super) fn find_slopes(&mut self, tree: &Joints<Fours>, joints: &[PlanarJoint]) {
-        let half = 0.5 * self.step;
-        for (i, (joint, to)) in joints.iter().zip(&mut self.slopes).enumerate() {
-            let link = tree.link(i);
-            let ([dx, dy], [rx, ry]) = (link.slide, link.rate);
-            let (weight, [turn, px, py]) = (half * link.weight, link.slope);
-            *to = Slope {
-                edge: link.edge,
-                plus: [joint.body.turn, half * rx + dx, half * ry + dy],
-                slope: [turn + weight, px, py],
-                push: [weight, link.force[1] + half * px, link.force[2] + half * py],
-                rate: link.rate,
-            };
-        }
-    }
-
-    /// A block of columns of `[G 1]`, and of what the momentum has beside the increment's part.
-    #[inline(always)]
-    pub(super) fn start_columns(
-        &mut self,
-        tree: &Joints<Fours>,
-        joints: &[PlanarJoint],
-        diagonal: &Diagonal<'_>,
-        first: usize,
-    ) {
-        let n = joints.len();
-        for (x, p) in self.increment.iter_mut().zip(&mut self.momentum) {
-            (*x, *p) = (Block::ZERO, Block::ZERO);
-        }
-        for lane in 0..LANES {
-            match first + lane {
-                column if column < n => self.by_configuration(tree, joints, diagonal, column, lane),
-                column if column < 2 * n => {
-                    self.increment[column - n].0[lane] = 1.0;
-                    self.momentum[column - n].0[lane] = 1.0;
-                }
-                _ => {}
-            }
-        }
-    }
-
-    #[inline(always)]
-    pub(super) fn write_columns(
-        &self,
-        increment: &mut [f64],
-        momentum: &mut [f64],
-        first: usize,
-        stride: usize,
-    ) {
-        let rows = increment.chunks_exact_mut(stride).zip(momentum.chunks_exact_mut(stride));
-        for ((by_x, by_p), (x, p)) in rows.zip(self.increment.iter().zip(&self.momentum)) {
-            by_x[first..][..LANES].copy_from_slice(&x.0);
-            by_p[first..][..LANES].copy_from_slice(&p.0);
-        }
-    }
-
-    /// A column of `G` and of `h L_qq`.
-    #[inline(always)]
-    fn by_configuration(
-        &mut self,
-        tree: &Joints<Fours>,
-        joints: &[PlanarJoint],
-        diagonal: &Diagonal<'_>,
-        column: usize,
-        lane: usize,
-    ) {
-        let (step, own, turn) = (self.step, tree.link(column), joints[column].body.turn);
-        // Rows of joints above, with the wrench moved to each of them, and of the joint itself.
-        let (mut wrench, push, mut i) = (own.slope, linear(own.slope), column + 1);
-        while i > 0 {
-            let (link, s) = (tree.link(i - 1), joints[i - 1].body.turn);
-            let stiffness = step * (dot(link.rate, push) + s * own.weight);
-            self.increment[i - 1].0[lane] =
-                0.5 * stiffness - (s * wrench[0] + dot(link.slide, push));
-            self.momentum[i - 1].0[lane] = stiffness;
-            wrench[0] += cross(link.edge, push);
-            i = joints[i - 1].parent;
-        }
-        // Rows of joints below.
-        let below = column + 1..column + 1 + joints[column].descendants;
-        let rows = self.increment[below.clone()].iter_mut().zip(&mut self.momentum[below.clone()]);
-        for ((x, p), i) in rows.zip(below) {
-            let link = tree.link(i);
-            let stiffness = step * (dot(own.rate, linear(link.slope)) + turn * link.weight);
-            x.0[lane] = 0.5 * stiffness - dot(own.rate, linear(link.force));
-            p.0[lane] = stiffness;
-        }
-        self.increment[column].0[lane] += diagonal.residual[column];
-        self.momentum[column].0[lane] += 2.0 * diagonal.residual[column];
-    }
-
-    /// From the leaves to the root, with the right-hand side taken away.
-    #[inline(always)]
-    fn eliminate(&mut self, joints: &[PlanarJoint]) {
-        let passages = self.elimination.generators.iter().zip(&self.elimination.passages);
-        for (i, ((joint, row), (generator, passage))) in
-            joints.iter().zip(&mut self.increment).zip(passages).enumerate().rev()
-        {
-            let flow = std::mem::replace(&mut self.flows[i + 1], [Block::ZERO; 3]);
-            let right = row.times(-1.0);
-            let pulled = product(generator.minus, flow);
-            *row = row.plus(pulled).times(-generator.inverse_d);
-            if joint.parent > 0 {
-                let up = passed_by_all(&passage.up, flow, right, passage.u_over_d);
-                add_to(&mut self.flows[joint.parent], up);
-            }
-        }
-    }
-
-    /// From the root to the leaves: the solution, and what joints above add to the momentum.
-    #[inline(always)]
-    fn substitute(&mut self, joints: &[PlanarJoint], diagonal: &Diagonal<'_>) {
-        let rows = self.increment.iter_mut().zip(&mut self.momentum);
-        let passages = self.slopes.iter().zip(&self.elimination.passages);
-        for (i, (((joint, (row, momentum)), own), (slope, passage))) in
-            joints.iter().zip(rows).zip(diagonal.momentum).zip(passages).enumerate()
-        {
-            let Slope { edge, plus, slope, .. } = *slope;
-            let (flow, right) = (self.motions[joint.parent], *row);
-            let slope = [slope[0] + cross(edge, linear(slope)), slope[1], slope[2]];
-            let x = right.plus(product(passage.w_over_d, flow).times(-1.0));
-            *row = x;
-            *momentum = momentum.plus(product(slope, flow)).plus(x.times(*own));
-            self.motions[i + 1] = passed_by_all(&passage.down, flow, right, plus);
-        }
-    }
-
-    /// From the root to the leaves: what joints above add to the momentum, with increments that are known.
-    #[inline(always)]
-    pub(super) fn carry_down(&mut self, joints: &[PlanarJoint], diagonal: &Diagonal<'_>) {
-        let rows = self.increment.iter().zip(&mut self.momentum);
-        for (i, ((joint, (x, momentum)), own)) in
-            joints.iter().zip(rows).zip(diagonal.momentum).enumerate()
-        {
-            let Slope { edge: [ex, ey], plus, slope, .. } = self.slopes[i];
-            let [turn, vx, vy] = self.motions[joint.parent];
-            let flow = [turn, vx.plus(turn.times(-ey)), vy.plus(turn.times(ex))];
-            *momentum = momentum.plus(product(slope, flow)).plus(x.times(*own));
-            self.motions[i + 1] = flow;
-            let [n, px, py] = plus;
-            add_to(&mut self.motions[i + 1], [x.times(n), x.times(px), x.times(py)]);
-        }
-    }
-
-    /// From the leaves to the root: what joints below add to the momentum.
-    #[inline(always)]
-    pub(super) fn gather(&mut self, joints: &[PlanarJoint]) {
-        let rows = self.increment.iter().zip(&mut self.momentum);
-        for (i, (joint, (x, momentum))) in joints.iter().zip(rows).enumerate().rev() {
-            let Slope { plus, push, rate, .. } = self.slopes[i];
-            let [n, fx, fy] = std::mem::replace(&mut self.flows[i + 1], [Block::ZERO; 3]);
-            let (n, fx, fy) =
-                (n.plus(x.times(push[0])), fx.plus(x.times(push[1])), fy.plus(x.times(push[2])));
-            let moved = n.times(plus[0]).plus(fx.times(rate[0])).plus(fy.times(rate[1]));
-            *momentum = momentum.plus(moved);
-            if joint.parent > 0 {
-                add_to(&mut self.flows[joint.parent], [n, fx, fy]);
-            }
-        }
+        in_eights(Linearize { recursion: self, tree, joints, diagonal, increment, momentum, stride });
     }
 }
 
-#[inline(always)]
-pub(super) fn product(vector: Vec3, [n, fx, fy]: [Block; 3]) -> Block {
-    n.times(vector[0]).plus(fx.times(vector[1])).plus(fy.times(vector[2]))
+struct Linearize<'a> {
+    recursion: &'a mut PlanarRecursion,
+    tree: &'a Joints<Fours>,
+    joints: &'a [PlanarJoint],
+    diagonal: &'a Diagonal<'a>,
+    increment: &'a mut [f64],
+    momentum: &'a mut [f64],
+    stride: usize,
 }
 
-/// [`passed`] for a block of right-hand sides.
-#[inline(always)]
-fn passed_by_all(matrix: &[Vec3; 3], flow: [Block; 3], b: Block, drive: Vec3) -> [Block; 3] {
-    let [r, s, t] = matrix;
-    let [n, fx, fy] = flow;
-    let of = |row: &Vec3, drive: f64| {
-        let first = n.times(row[0]).plus(fx.times(row[1]));
-        first.plus(fy.times(row[2]).plus(b.times(drive)))
-    };
-    [of(r, drive[0]), of(s, drive[1]), of(t, drive[2])]
-}
+impl InEights for Linearize<'_> {
+    type Output = ();
 
-#[inline(always)]
-pub(super) fn add_to(sum: &mut [Block; 3], part: [Block; 3]) {
-    let [n, fx, fy] = *sum;
-    *sum = [n.plus(part[0]), fx.plus(part[1]), fy.plus(part[2])];
+    #[inline(always)]
+    fn run<E: Eight>(self) {
+        let Self { recursion, tree, joints, diagonal, increment, momentum, stride } = self;
+        let PlanarRecursion { elimination, columns } = recursion;
+        columns.find_slopes(tree, joints);
+        for first in (0..stride).step_by(LANES) {
+            columns.start::<E>(tree, joints, diagonal, first);
+            columns.eliminate::<E>(elimination, joints, first);
+            columns.substitute::<E>(&elimination.passages, joints, diagonal);
+            columns.gather::<E>(joints);
+            columns.write::<E>(increment, momentum, first, stride);
+        }
+    }
 }
 
 #[cfg(test)]
