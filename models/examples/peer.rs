@@ -48,13 +48,19 @@ struct Link {
     turn: Option<[f64; 4]>,
 }
 
-/// Two points that coincide; the mechanism moves in the plane of x and z.
+/// Two points that coincide along some axes.
 #[derive(Deserialize)]
 struct Loop {
     body_a: i64,
     at_a: [f64; 3],
     body_b: i64,
     at_b: [f64; 3],
+    #[serde(default = "in_plane")]
+    axes: Vec<Axis>,
+}
+
+fn in_plane() -> Vec<Axis> {
+    vec![Axis::X, Axis::Z]
 }
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -241,7 +247,7 @@ fn scene(mechanism: &Mechanism) -> Scene {
         name: format!("loop{i}"),
         a: point(l.body_a, l.at_a),
         b: point(l.body_b, l.at_b),
-        axes: vec![Axis::X, Axis::Z],
+        axes: l.axes.clone(),
     });
     Scene {
         format: 1,

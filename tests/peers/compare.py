@@ -121,6 +121,7 @@ def start_pinocchio():
         write_dop853(program.with_name("dop853.h"))
         flags = ["-std=c++17", "-w", "-O3", "-march=native", "-DNDEBUG"]
         flags += ["-DBOOST_MPL_LIMIT_LIST_SIZE=30", "-DBOOST_MPL_CFG_NO_PREPROCESSED_HEADERS"]
+        flags += ["-DBOOST_FUSION_INVOKE_MAX_ARITY=12"]
         flags += [f"-I{include}", f"-I{include}/eigen3", f"-I{program.parent}"]
         run(["g++", *flags, "-o", program, source])
     return Driver([program], ".txt")
@@ -201,7 +202,7 @@ AB_METHODS = [
     ("MuJoCo", "euler-ab"),
 ]
 # Arms, floating robots and ball joints: motions of 2 ms steps, also with torques that change at each of them.
-ROBOTS = ["panda", "g1-fixed", "go1", "anymal", "g1", "talos", "B7", "B15", "K8"]
+ROBOTS = ["panda", "g1-fixed", "go1", "anymal", "g1", "talos", "go1-feet", "B7", "B15", "K8"]
 ROBOT_METHODS = [
     PLANTD,
     ("Pinocchio", "euler"),

@@ -5,7 +5,8 @@ centre of mass `com` and diagonal `inertia` about it, in the body's axes. A join
 `slide`, `ball` or `free`; hinges and slides may have `stiffness` about `rest`, and `damping`. In q0 an orientation
 is a rotation vector, after the place of a free body; in v0 its velocity is in the body's axes. Robots also have
 the orientation `turn` of a joint in its parent as a quaternion, w first, and products of inertia `Ixy`, `Ixz`, `Iyz`
-after the moments. `rough` are the largest of the torques that change at each step. Units are SI.
+after the moments. `rough` are the largest of the torques that change at each step. A loop holds a point of one body
+at a point of another, or of the world, along `axes`: x and z unless it says more. Units are SI.
 """
 
 import math
@@ -227,8 +228,13 @@ ROBOTS = {
 }
 
 
-def robot(name):
-    """A robot as Pinocchio reads it."""
+# The same standing: robot, pose of each leg, frames of the feet.
+STANDING = {
+    "go1-feet": ("go1", [0.1, 0.9, -1.8], ["FL_foot", "FR_foot", "RL_foot", "RR_foot"]),
+}
+
+
+def pinocchio_model(name):
     import pathlib
 
     import pinocchio as pin
@@ -242,6 +248,14 @@ def robot(name):
     if held:
         held = [model.getJointId(joint) for joint in held]
         model = pin.buildReducedModel(model, held, pin.neutral(model))
+    return model
+
+
+def robot(name):
+    """A robot as Pinocchio reads it."""
+    import pinocchio as pin
+
+    model = pinocchio_model(name)
     bodies = []
     for i in range(1, model.njoints):
         place, inertia, kind = model.jointPlacements[i], model.inertias[i], model.joints[i].shortname()
@@ -264,6 +278,30 @@ def robot(name):
     return moving(name, bodies)
 
 
+def standing(name):
+    """A robot each of whose feet is held at a point of the world; its base moves, and the legs as they must."""
+    import numpy as np
+    import pinocchio as pin
+
+    free, leg, feet = STANDING[name]
+    m, model = robot(free), pinocchio_model(free)
+    data, feet = model.createData(), [model.getFrameId(foot) for foot in feet]
+    q0, v0 = m["q0"][:6] + leg * len(feet), np.zeros(model.nv)
+    v0[:6] = m["v0"][:6]
+    q = np.array(q0[:3] + [0.0, 0.0, 0.0, 1.0] + q0[6:])
+    pin.computeJointJacobians(model, data, q)
+    pin.framesForwardKinematics(model, data, q)
+    by_v = [pin.getFrameJacobian(model, data, foot, pin.LOCAL_WORLD_ALIGNED)[:3] for foot in feet]
+    by_v = np.vstack(by_v)
+    v0[6:] = np.linalg.solve(by_v[:, 6:], -by_v[:, :6] @ v0[:6])
+    loops = []
+    for foot in feet:
+        body, at = model.frames[foot].parentJoint - 1, model.frames[foot].placement.translation
+        place = data.oMf[foot].translation
+        loops.append(dict(body_a=body, at_a=at.tolist(), body_b=-1, at_b=place.tolist(), axes=["x", "y", "z"]))
+    return m | dict(name=name, q0=q0, v0=v0.tolist(), loops=loops)
+
+
 SINGLE = {"P": pendulum, "D": double_pendulum, "S": spherical_pendulum, "L": four_bar}
 FAMILIES = {"B": ball_tree, "K": ball_chain, "C": chain, "H": hanging_chain, "T": tree, "X": scissor}
 
@@ -272,17 +310,21 @@ def named(name):
     """The mechanism of that name, for example P or C32."""
     if name in ROBOTS:
         return robot(name)
+    if name in STANDING:
+        return standing(name)
     return SINGLE[name]() if name in SINGLE else FAMILIES[name[0]](int(name[1:]))
 
 
 def text(m):
-    """Numbers alone: bodies, loops, gravity; a line per body; q0; v0; rough torques."""
+    """Numbers alone: bodies, loops, gravity; a line per body; q0; v0; rough torques; a line per loop."""
     lines = [[len(m["bodies"]), len(m["loops"]), m["gravity"]]]
     for b in m["bodies"]:
         inertia = [*b["inertia"], 0, 0, 0][:6]
         lines.append([SIZES[joint_type(b)], b["parent"], *b["pos"], *b.get("turn", [1, 0, 0, 0])])
         lines[-1] += [*b["axis"], b["mass"], *b["com"], *inertia]
     lines += [m["q0"], m["v0"], m.get("rough", [0] * len(m["v0"]))]
+    for l in m["loops"]:
+        lines.append([len(l.get("axes", "xz")), l["body_a"], *l["at_a"], l["body_b"], *l["at_b"]])
     return "".join(" ".join(map(repr, line)) + "\n" for line in lines)
 
 
@@ -318,13 +360,17 @@ def mjcf(m):
             lines.append(
                 f'<inertial pos="{spread(b["com"])}" mass="{b["mass"]!r}" {kind}="{spread(inertia)}"/>'
             )
-            for k, loop in enumerate(m["loops"]):
-                for side in "ab":
-                    if loop[f"body_{side}"] == i:
-                        lines.append(f'<site name="{side}{k}" pos="{spread(loop[f"at_{side}"])}"/>')
+            add_sites(i)
             open_bodies(i)
             lines.append("</body>")
 
+    def add_sites(i):
+        for k, loop in enumerate(m["loops"]):
+            for side in "ab":
+                if loop[f"body_{side}"] == i:
+                    lines.append(f'<site name="{side}{k}" pos="{spread(loop[f"at_{side}"])}"/>')
+
+    add_sites(-1)
     open_bodies(-1)
     turns = [joint_type(b) in ("ball", "free") for b in m["bodies"]]
     rough, motors, at = m.get("rough"), "", 0
@@ -337,7 +383,11 @@ def mjcf(m):
                 motors += f'<motor joint="j{i}" gear="{spread(gear)}"{most}/>'
         at += size
     q0 = [x for (_, q, _), turn in zip(parts(m), turns) for x in (q[:-3] + quaternion(q[-3:]) if turn else q)]
-    connects = "".join(f'<connect site1="a{k}" site2="b{k}"/>' for k in range(len(m["loops"])))
+    connects = ""
+    for k, loop in enumerate(m["loops"]):
+        # As hard as MuJoCo allows; in a plane its third equation is one too many, and the softness is needed.
+        hard = ' solimp="0.9999 0.9999"' if len(loop.get("axes", "xz")) == 3 else ""
+        connects += f'<connect site1="a{k}" site2="b{k}"{hard}/>'
     return f"""<mujoco model="{m["name"]}">
 <compiler angle="radian" autolimits="false" boundmass="0" boundinertia="0"/>
 <size nuser_actuator="1"/>

@@ -3,7 +3,9 @@
 //
 // Methods: `euler`, `rk4`, `dop853:TOLERANCE` (DT is the whole time then), `euler-ab`; `euler` and `euler-ab`
 // also with `-rough`, new torques at each step. Of ball and free joints A is by turns in the body's axes.
+// Points that coincide in space are constraints: `constraintDynamics` and its derivatives take ABA's place.
 
+#include <array>
 #include <cmath>
 #include <cstdlib>
 #include <fstream>
@@ -15,6 +17,8 @@
 
 #include <pinocchio/algorithm/aba-derivatives.hpp>
 #include <pinocchio/algorithm/aba.hpp>
+#include <pinocchio/algorithm/constrained-dynamics-derivatives.hpp>
+#include <pinocchio/algorithm/constrained-dynamics.hpp>
 #include <pinocchio/algorithm/joint-configuration.hpp>
 #include <pinocchio/multibody.hpp>
 
@@ -33,13 +37,15 @@ struct Mechanism {
   // Joints that turn as no coordinates do, and the first velocity that has a motor.
   std::vector<pinocchio::JointIndex> groups;
   int first_motor = 0;
+  std::vector<pinocchio::RigidConstraintModel> constraints;
+  std::vector<pinocchio::RigidConstraintData> constraint_data;
+  pinocchio::ProximalSettings settings;
 
   explicit Mechanism(const std::string &path) {
     std::ifstream in(path);
     int n, loops;
     double gravity;
     if (!(in >> n >> loops >> gravity)) throw std::runtime_error("no mechanism");
-    if (loops != 0) throw std::runtime_error("loops are not driven");
     model.gravity.linear() = Eigen::Vector3d(0, 0, -gravity);
     std::vector<int> sizes;
     for (int i = 0; i < n; ++i) {
@@ -97,6 +103,14 @@ struct Mechanism {
     }
     for (double &v : v0) in >> v;
     for (double &r : rough) in >> r;
+    for (int i = 0; i < loops; ++i) {
+      int axes, a, b;
+      Eigen::Vector3d at_a, at_b;
+      in >> axes >> a >> at_a[0] >> at_a[1] >> at_a[2] >> b >> at_b[0] >> at_b[1] >> at_b[2];
+      if (axes != 3) throw std::runtime_error("planar loops are not driven");
+      const pinocchio::SE3 place_a(Eigen::Matrix3d::Identity(), at_a), place_b(Eigen::Matrix3d::Identity(), at_b);
+      constraints.emplace_back(pinocchio::CONTACT_3D, model, a + 1, place_a, b + 1, place_b, pinocchio::LOCAL);
+    }
     if (!in) throw std::runtime_error("a mechanism breaks off");
     if (first_motor == 6) {
       // The velocity of a free body is along the world's axes in the file.
@@ -105,6 +119,8 @@ struct Mechanism {
     }
     tau = VectorXd::Zero(model.nv);
     data = std::make_unique<pinocchio::Data>(model);
+    for (const auto &constraint : constraints) constraint_data.emplace_back(constraint.createData());
+    pinocchio::initConstraintDynamics(model, *data, constraints, constraint_data);
   }
 };
 
@@ -114,7 +130,9 @@ public:
       : m_(mechanism), n_(m_.model.nv), q(m_.q0), v(m_.v0), A(2 * n_, 2 * n_),
         B(2 * n_, n_ - m_.first_motor), dq_(n_, n_), dv_(n_, n_), minverse_(n_, n_), y_(2 * n_),
         stage_(2 * n_), scale_(2 * n_), k_(2 * n_, 13), by_q_(MatrixXd::Zero(n_, n_)),
-        by_v_(MatrixXd::Zero(n_, n_)), step_(n_) {}
+        by_v_(MatrixXd::Zero(n_, n_)), step_(n_) {
+    by_lambda_.fill(MatrixXd::Zero(3 * m_.constraints.size(), n_));
+  }
 
   // The same torques as in all drivers.
   void draw(long step) {
@@ -167,9 +185,16 @@ public:
   }
 
   void euler_and_derivatives(double h) {
-    pinocchio::computeABADerivatives(m_.model, *m_.data, q, v, m_.tau, dq_, dv_, minverse_);
-    minverse_.triangularView<Eigen::StrictlyLower>() =
-        minverse_.transpose().triangularView<Eigen::StrictlyLower>();
+    if (m_.constraints.empty()) {
+      pinocchio::computeABADerivatives(m_.model, *m_.data, q, v, m_.tau, dq_, dv_, minverse_);
+      minverse_.triangularView<Eigen::StrictlyLower>() =
+          minverse_.transpose().triangularView<Eigen::StrictlyLower>();
+    } else {
+      acceleration(q, v);
+      auto &[dq, dv, dtau] = by_lambda_;
+      pinocchio::computeConstraintDynamicsDerivatives(
+          m_.model, *m_.data, m_.constraints, m_.constraint_data, m_.settings, dq_, dv_, minverse_, dq, dv, dtau);
+    }
     A.bottomLeftCorner(n_, n_) = h * dq_;
     A.bottomRightCorner(n_, n_) = h * dv_;
     A.bottomRightCorner(n_, n_).diagonal().array() += 1;
@@ -258,7 +283,11 @@ private:
   }
 
   const VectorXd &acceleration(const VectorXd &at, const VectorXd &velocity) {
-    return pinocchio::aba(m_.model, *m_.data, at, velocity, m_.tau, pinocchio::Convention::WORLD);
+    if (m_.constraints.empty()) {
+      return pinocchio::aba(m_.model, *m_.data, at, velocity, m_.tau, pinocchio::Convention::WORLD);
+    }
+    return pinocchio::constraintDynamics(
+        m_.model, *m_.data, at, velocity, m_.tau, m_.constraints, m_.constraint_data, m_.settings);
   }
 
   void rate(const VectorXd &y, int column) {
@@ -279,6 +308,7 @@ private:
   MatrixXd dq_, dv_, minverse_;
   VectorXd y_, stage_, scale_, at_, velocity_;
   MatrixXd k_, by_q_, by_v_;
+  std::array<MatrixXd, 3> by_lambda_;
   VectorXd step_, next_ = VectorXd(m_.model.nq);
 };
 
