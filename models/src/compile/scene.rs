@@ -427,10 +427,11 @@ impl Layout {
                 }
                 scene::Constraint::PointToPoint { a, b, axes, .. } => {
                     let points = places.between_in_world(self.attachment(a), self.attachment(b));
-                    for &axis in axes {
+                    for (k, &axis) in axes.iter().enumerate() {
                         let axis = axis as usize;
                         let points = points.clone();
-                        let kind = ConstraintKind::Axis(AlongAxis { points, axis });
+                        let others = axes[k + 1..].iter().map(|&axis| axis as usize).collect();
+                        let kind = ConstraintKind::Axis(AlongAxis { points, axis, others });
                         equations.push(format!("{name}.{}", AXES[axis]), kind);
                     }
                 }

@@ -37,6 +37,21 @@ pub(crate) struct Closure<S: Scalar = f64> {
     pub(crate) in_plane: Option<Box<InPlane>>,
 }
 
+/// `Σ |h_i q_i|`.
+#[inline(always)]
+fn moved<S: Scalar>(row: &[S], q: &[S]) -> f64 {
+    let ((rows, row), (all, q)) = (row.as_chunks::<4>(), q.as_chunks::<4>());
+    let product = |entry: S, q: S| (entry * q).value().abs();
+    let mut sums = [0.0; 4];
+    for (row, q) in rows.iter().zip(all) {
+        for (sum, (entry, q)) in sums.iter_mut().zip(row.iter().zip(q)) {
+            *sum += product(*entry, *q);
+        }
+    }
+    let rest: f64 = row.iter().zip(q).map(|(entry, q)| product(*entry, *q)).sum();
+    sums.iter().sum::<f64>() + rest
+}
+
 /// Multipliers of equations along world axes as forces `f` at the points `p` that a joint carries.
 #[derive(Clone, Copy, Debug)]
 struct Pull<S> {
@@ -101,13 +116,17 @@ impl<S: Scalar> Closure<S> {
     pub(crate) fn evaluate(&mut self, model: &Model, q: &[S], orientations: &[Mat3<S>]) {
         self.is_complete = false;
         self.poses.evaluate(&model.closure, q, orientations);
-        for (c, constraint) in model.constraints.iter().enumerate() {
-            let (value, magnitude) =
-                constraint.value(Place { tree: &model.closure, poses: &self.poses, q });
-            self.value[c] = value;
-            // Not less than what the smallest numbers are rounded by: some terms may all be zero.
-            self.round_off[c] =
-                f64::EPSILON * magnitude + self.coordinate_round_off[c] + f64::MIN_POSITIVE;
+        let at = Place { tree: &model.closure, poses: &self.poses, q };
+        let mut c = 0;
+        while let Some(constraint) = model.constraints.get(c) {
+            let together = c..c + constraint.count();
+            let magnitude = constraint.value(at, &mut self.value[together.clone()]);
+            for c in together.clone() {
+                // Not less than what the smallest numbers are rounded by: some terms may all be zero.
+                self.round_off[c] =
+                    f64::EPSILON * magnitude + self.coordinate_round_off[c] + f64::MIN_POSITIVE;
+            }
+            c = together.end;
         }
     }
 
@@ -120,15 +139,16 @@ impl<S: Scalar> Closure<S> {
     #[inline(never)]
     pub(crate) fn differentiate(&mut self, model: &Model, q: &[S]) {
         let n = model.dimensions.coordinates();
-        for (c, constraint) in model.constraints.iter().enumerate() {
-            let row = &mut self.jacobian[c * n..][..n];
-            for &i in &constraint.coordinates {
-                row[i] = S::ZERO;
-            }
-            constraint.differentiate(Place { tree: &model.closure, poses: &self.poses, q }, row);
-            let moved: f64 =
-                constraint.coordinates.iter().map(|&i| (row[i] * q[i]).value().abs()).sum();
-            self.coordinate_round_off[c] = f64::EPSILON * moved;
+        let at = Place { tree: &model.closure, poses: &self.poses, q };
+        self.jacobian.fill(S::ZERO);
+        let mut c = 0;
+        while let Some(constraint) = model.constraints.get(c) {
+            constraint.differentiate(at, &mut self.jacobian[c * n..]);
+            c += constraint.count();
+        }
+        let rows = self.jacobian.chunks_exact(n).zip(&mut self.coordinate_round_off);
+        for (row, round_off) in rows {
+            *round_off = f64::EPSILON * moved(row, q);
         }
     }
 
@@ -162,9 +182,7 @@ impl<S: Scalar> Closure<S> {
         let mut are_pulled = false;
         for (constraint, &lambda) in model.constraints.iter().zip(multipliers) {
             match &constraint.kind {
-                ConstraintKind::Axis(AlongAxis { points, axis })
-                    if !model.closure.has_other_joints =>
-                {
+                ConstraintKind::Axis(AlongAxis { points, axis, .. }) => {
                     let mut force = Vec3::ZERO;
                     force.0[*axis] = lambda;
                     self.pull(model, points, force);
@@ -234,14 +252,16 @@ impl<S: Scalar> Closure<S> {
         at.difference * factor
     }
 
-    /// Adds the second derivatives of `Σ f·p` by the coordinates of hinges and sliders, O(n·depth) for
-    /// however many forces: with joint `i`, axis `w_i`, at or above joint `j`, and the sums over what
-    /// `j` carries,
+    /// Adds the second derivatives of `Σ f·p`, O(n·depth) for however many forces: with joint `i`, axis `w_i`, at
+    /// or above joint `j`, and the sums over what `j` carries,
     ///
     /// ```text
     /// w_i · Σ ∂p/∂q_j × f      hinge: Σ (w × (p − o)) × f = Σ p fᵀ w − o (F·w) − w (Σ p·f − o·F)
-    ///                          slider: w × F
+    ///                          slider: w × F      screw: both
     /// ```
+    ///
+    /// Sliders above turn nothing. The axes of a ball joint turn with it: of two of them, the derivative in row `i`
+    /// and column `j` is `w_j · Σ ∂p/∂q_i × f`.
     fn add_pulls(&mut self, tree: &Tree, n: usize, out: &mut [S]) {
         for (j, joint) in tree.joints.iter().enumerate().rev() {
             let pull = self.pulls[j];
@@ -252,20 +272,29 @@ impl<S: Scalar> Closure<S> {
                 parent.add(&pull);
             }
             let (axis, place) = (self.poses.axis(j), self.poses.position[j]);
-            let torque = if joint.kind == JointKind::Revolute {
-                let [x, y, z] = pull.product.0;
-                let along = x[0] + y[1] + z[2] - place.dot(pull.force);
+            let [x, y, z] = pull.product.0;
+            let along = x[0] + y[1] + z[2] - place.dot(pull.force);
+            let of_hinge = |axis: Vec3<S>| {
                 pull.product.apply(axis) - place * pull.force.dot(axis) - axis * along
-            } else {
-                axis.cross(pull.force)
             };
+            let torque = match joint.kind {
+                JointKind::Revolute | JointKind::Ball(_) => of_hinge(axis),
+                JointKind::Prismatic => axis.cross(pull.force),
+                JointKind::Screw(pitch) => of_hinge(axis) + axis.cross(pull.force).scaled(pitch),
+            };
+            let own = joint.coordinate;
             let mut i = j;
             while let Some(above) = tree.joints.get(i) {
-                if above.kind == JointKind::Revolute {
+                if above.kind != JointKind::Prismatic {
                     let value = self.poses.axis(i).dot(torque);
-                    out[above.coordinate * n + joint.coordinate] += value;
+                    out[own * n + above.coordinate] += value;
                     if i != j {
-                        out[joint.coordinate * n + above.coordinate] += value;
+                        let mirrored = if tree.one_ball(i, j) {
+                            axis.dot(of_hinge(self.poses.axis(i)))
+                        } else {
+                            value
+                        };
+                        out[above.coordinate * n + own] += mirrored;
                     }
                 }
                 i = above.parent;

@@ -21,11 +21,17 @@ pub(crate) trait Equation {
     /// The coordinates that it depends on, but for a prescribed length; a coordinate may come more than once.
     fn coordinates(&self) -> Vec<usize>;
 
-    /// `h`, and the magnitude of what was added for it.
-    fn value<S: Scalar>(&self, at: Place<'_, S>) -> (S, f64);
+    /// How many equations are found at once: this one, and those after it that are about the same points.
+    #[inline(always)]
+    fn count(&self) -> usize {
+        1
+    }
 
-    /// Writes `h_i` into a row of the Jacobian, whose other entries are zero.
-    fn differentiate<S: Scalar>(&self, at: Place<'_, S>, row: &mut [S]);
+    /// Writes `h` of the equations that are found at once; returns the magnitude of what was added for each.
+    fn value<S: Scalar>(&self, at: Place<'_, S>, values: &mut [S]) -> f64;
+
+    /// Writes their `h_i` into rows of the Jacobian, which are zero; others follow.
+    fn differentiate<S: Scalar>(&self, at: Place<'_, S>, rows: &mut [S]);
 
     /// Calls `entry(i, j, h_ij)` for ordered pairs of coordinates; a pair may come more than once, and its values
     /// add.
@@ -51,24 +57,35 @@ impl ConstraintKind {
 
 impl Constraint {
     #[inline]
-    pub(crate) fn value<S: Scalar>(&self, at: Place<'_, S>) -> (S, f64) {
+    pub(crate) fn count(&self) -> usize {
         match &self.kind {
-            ConstraintKind::Distance(equation) => equation.value(at),
-            ConstraintKind::Axis(equation) => equation.value(at),
-            ConstraintKind::Product(equation) => equation.value(at),
-            ConstraintKind::PathLength(equation) => equation.value(at),
-            ConstraintKind::Coupling(equation) => equation.value(at),
+            ConstraintKind::Distance(equation) => equation.count(),
+            ConstraintKind::Axis(equation) => equation.count(),
+            ConstraintKind::Product(equation) => equation.count(),
+            ConstraintKind::PathLength(equation) => equation.count(),
+            ConstraintKind::Coupling(equation) => equation.count(),
         }
     }
 
     #[inline]
-    pub(crate) fn differentiate<S: Scalar>(&self, at: Place<'_, S>, row: &mut [S]) {
+    pub(crate) fn value<S: Scalar>(&self, at: Place<'_, S>, values: &mut [S]) -> f64 {
         match &self.kind {
-            ConstraintKind::Distance(equation) => equation.differentiate(at, row),
-            ConstraintKind::Axis(equation) => equation.differentiate(at, row),
-            ConstraintKind::Product(equation) => equation.differentiate(at, row),
-            ConstraintKind::PathLength(equation) => equation.differentiate(at, row),
-            ConstraintKind::Coupling(equation) => equation.differentiate(at, row),
+            ConstraintKind::Distance(equation) => equation.value(at, values),
+            ConstraintKind::Axis(equation) => equation.value(at, values),
+            ConstraintKind::Product(equation) => equation.value(at, values),
+            ConstraintKind::PathLength(equation) => equation.value(at, values),
+            ConstraintKind::Coupling(equation) => equation.value(at, values),
+        }
+    }
+
+    #[inline]
+    pub(crate) fn differentiate<S: Scalar>(&self, at: Place<'_, S>, rows: &mut [S]) {
+        match &self.kind {
+            ConstraintKind::Distance(equation) => equation.differentiate(at, rows),
+            ConstraintKind::Axis(equation) => equation.differentiate(at, rows),
+            ConstraintKind::Product(equation) => equation.differentiate(at, rows),
+            ConstraintKind::PathLength(equation) => equation.differentiate(at, rows),
+            ConstraintKind::Coupling(equation) => equation.differentiate(at, rows),
         }
     }
 

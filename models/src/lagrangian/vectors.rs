@@ -21,11 +21,11 @@ pub(crate) struct Separation<S = f64> {
 }
 
 impl PointPair {
-    /// Whether no joint carries both, and all of them are hinges and sliders.
+    /// Whether no joint carries both.
     #[inline]
     pub(crate) fn are_apart(&self, tree: &Tree) -> bool {
         let root = |joint: usize| tree.joints.get(joint).map(|joint| joint.root);
-        !tree.has_other_joints && (root(self.a.joint) != root(self.b.joint))
+        root(self.a.joint) != root(self.b.joint)
     }
 
     /// The separation of the points. Origins cancel exactly within one tree.

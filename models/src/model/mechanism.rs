@@ -482,6 +482,8 @@ pub(crate) struct AlongAxis {
     pub(crate) points: PointPair,
     /// A world axis.
     pub(crate) axis: usize,
+    /// Axes of the equations after this one that are about the same points.
+    pub(crate) others: Vec<usize>,
 }
 
 /// `Σ |d_s| − length = 0` over the segments of a path.

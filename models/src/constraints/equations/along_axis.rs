@@ -11,22 +11,40 @@ use crate::constraints::equations::Equation;
 use crate::lagrangian::kinematics::Place;
 use crate::model::mechanism::AlongAxis;
 
+impl AlongAxis {
+    /// Its own axis, and those of the equations that follow.
+    #[inline(always)]
+    fn axes(&self) -> impl Iterator<Item = usize> {
+        [self.axis].into_iter().chain(self.others.iter().copied())
+    }
+}
+
 impl Equation for AlongAxis {
+    fn count(&self) -> usize {
+        1 + self.others.len()
+    }
+
     fn coordinates(&self) -> Vec<usize> {
         self.points.coordinates().collect()
     }
 
     #[inline(always)]
-    fn value<S: Scalar>(&self, Place { tree, poses, .. }: Place<'_, S>) -> (S, f64) {
+    fn value<S: Scalar>(&self, Place { tree, poses, .. }: Place<'_, S>, values: &mut [S]) -> f64 {
         let at = self.points.separation(tree, poses);
-        (at.difference[self.axis], at.magnitude)
+        for (axis, value) in self.axes().zip(values) {
+            *value = at.difference[axis];
+        }
+        at.magnitude
     }
 
     #[inline(always)]
-    fn differentiate<S: Scalar>(&self, Place { tree, poses, .. }: Place<'_, S>, row: &mut [S]) {
+    fn differentiate<S: Scalar>(&self, Place { tree, poses, q }: Place<'_, S>, rows: &mut [S]) {
         let at = self.points.separation(tree, poses);
         for joint in &self.points.path {
-            row[joint.coordinate] += joint.gradient(tree, poses, &at)[self.axis];
+            let gradient = joint.gradient(tree, poses, &at);
+            for (axis, row) in self.axes().zip(rows.chunks_exact_mut(q.len())) {
+                row[joint.coordinate] = gradient[axis];
+            }
         }
     }
 

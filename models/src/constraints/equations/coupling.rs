@@ -16,14 +16,15 @@ impl Equation for Coupling {
     }
 
     #[inline(never)]
-    fn value<S: Scalar>(&self, Place { q, .. }: Place<'_, S>) -> (S, f64) {
+    fn value<S: Scalar>(&self, Place { q, .. }: Place<'_, S>, values: &mut [S]) -> f64 {
         let (mut value, mut magnitude) = (S::constant(self.constant), self.constant.abs());
         for term in &self.terms {
             let term = term.value(q);
             value += term;
             magnitude += term.value().abs();
         }
-        (value, magnitude)
+        values[0] = value;
+        magnitude
     }
 
     #[inline(always)]

@@ -18,7 +18,7 @@ impl Equation for PathLength {
     }
 
     #[inline(never)]
-    fn value<S: Scalar>(&self, Place { tree, poses, q }: Place<'_, S>) -> (S, f64) {
+    fn value<S: Scalar>(&self, Place { tree, poses, q }: Place<'_, S>, values: &mut [S]) -> f64 {
         let length = self.length.at(q);
         let (mut value, mut magnitude) = (-length, length.value());
         for segment in &self.segments {
@@ -26,7 +26,8 @@ impl Equation for PathLength {
             value += segment.length;
             magnitude += segment.magnitude();
         }
-        (value, magnitude)
+        values[0] = value;
+        magnitude
     }
 
     #[inline(always)]

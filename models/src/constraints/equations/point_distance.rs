@@ -17,13 +17,13 @@ impl Equation for PointDistance {
     }
 
     #[inline(always)]
-    fn value<S: Scalar>(&self, Place { tree, poses, q }: Place<'_, S>) -> (S, f64) {
+    fn value<S: Scalar>(&self, Place { tree, poses, q }: Place<'_, S>, values: &mut [S]) -> f64 {
         let at = self.points.separation(tree, poses);
         let length = self.length.at(q);
         let square = at.difference.dot(at.difference);
         let squared_length = length * length;
-        let round_off = 2.0 * square.value().sqrt() * at.magnitude + squared_length.value();
-        (square - squared_length, round_off)
+        values[0] = square - squared_length;
+        2.0 * square.value().sqrt() * at.magnitude + squared_length.value()
     }
 
     #[inline(always)]

@@ -19,9 +19,10 @@ impl Equation for Product {
     }
 
     #[inline(always)]
-    fn value<S: Scalar>(&self, Place { tree, poses, .. }: Place<'_, S>) -> (S, f64) {
+    fn value<S: Scalar>(&self, Place { tree, poses, .. }: Place<'_, S>, values: &mut [S]) -> f64 {
         let at = ProductAt::new(self, tree, poses);
-        (at.value(), at.magnitude())
+        values[0] = at.value();
+        at.magnitude()
     }
 
     #[inline(always)]
