@@ -5,7 +5,7 @@
 
 use plantd_math::norms::larger;
 use plantd_math::scalar::Scalar;
-use plantd_math::spatial::{Mat3, Vec3};
+use plantd_math::spatial::{Mat3, Vec3, three};
 
 use crate::constraints::in_plane::InPlane;
 use crate::lagrangian::kinematics::{Place, Poses};
@@ -14,6 +14,17 @@ use crate::model::tree::{JointKind, Tree};
 
 /// A configuration may violate a constraint by this fraction of the lengths involved.
 const TOLERANCE: f64 = 1e-6;
+
+/// What is known at a configuration.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Known {
+    /// Values at most.
+    Nothing,
+    /// Wrenches of loops, too.
+    Place,
+    /// And the Jacobian.
+    All,
+}
 
 /// The constraints at a configuration.
 #[derive(Clone, Debug)]
@@ -31,8 +42,10 @@ pub(crate) struct Closure<S: Scalar = f64> {
     pulls: Vec<Pull<S>>,
     /// Of a distance, by the coordinates on the path between its ends.
     gradients: Vec<(usize, Vec3<S>)>,
-    /// Values and Jacobian, and wrenches of loops, are at one configuration.
-    pub(crate) is_complete: bool,
+    /// What is at the configuration of the last [`Closure::evaluate`].
+    pub(crate) known: Known,
+    /// Parts of the Jacobian as they were before they were turned, and where.
+    unturned: Vec<(usize, Vec3<S>)>,
     /// In place of the Jacobian, where loops are eliminated in the plane.
     pub(crate) in_plane: Option<Box<InPlane>>,
 }
@@ -106,7 +119,8 @@ impl<S: Scalar> Closure<S> {
             coordinate_round_off: vec![0.0; nc],
             pulls: vec![Pull::NONE; model.closure.joints.len()],
             gradients: Vec::with_capacity(model.closure.joints.len()),
-            is_complete: false,
+            known: Known::Nothing,
+            unturned: Vec::with_capacity(nc * model.orientations.len()),
             in_plane: model.loops.as_ref().map(|loops| Box::new(InPlane::new(loops))),
         }
     }
@@ -114,7 +128,7 @@ impl<S: Scalar> Closure<S> {
     /// Values at `q`, with the orientations of ball joints.
     #[inline(never)]
     pub(crate) fn evaluate(&mut self, model: &Model, q: &[S], orientations: &[Mat3<S>]) {
-        self.is_complete = false;
+        self.known = Known::Nothing;
         self.poses.evaluate(&model.closure, q, orientations);
         let at = Place { tree: &model.closure, poses: &self.poses, q };
         let mut c = 0;
@@ -141,6 +155,7 @@ impl<S: Scalar> Closure<S> {
         let n = model.dimensions.coordinates();
         let at = Place { tree: &model.closure, poses: &self.poses, q };
         self.jacobian.fill(S::ZERO);
+        self.unturned.clear();
         let mut c = 0;
         while let Some(constraint) = model.constraints.get(c) {
             constraint.differentiate(at, &mut self.jacobian[c * n..]);
@@ -309,7 +324,39 @@ impl Closure {
         self.evaluate(model, q, orientations);
         self.differentiate(model, q);
         self.place_in_plane(model, q);
-        self.is_complete = true;
+        self.known = Known::All;
+    }
+
+    /// Finds what a step begins with, at the configuration of the last [`Closure::evaluate`].
+    pub(crate) fn begin(&mut self, model: &Model, q: &[f64]) {
+        if self.in_plane.is_some() {
+            self.place_in_plane(model, q);
+            self.known = Known::Place;
+        } else {
+            self.differentiate(model, q);
+            self.known = Known::All;
+        }
+    }
+
+    /// Whether parts of the Jacobian are turned.
+    pub(crate) fn is_turned(&self) -> bool {
+        !self.unturned.is_empty()
+    }
+
+    /// Turns the parts of the Jacobian, of `n` columns, that stand in three columns from `i` on.
+    pub(crate) fn turn(&mut self, i: usize, n: usize, turned: impl Fn(Vec3) -> Vec3) {
+        for (c, row) in self.jacobian.chunks_exact_mut(n).enumerate() {
+            let part = three(row, i);
+            self.unturned.push((c * n + i, part));
+            row[i..i + 3].copy_from_slice(&turned(part).0);
+        }
+    }
+
+    /// Makes the Jacobian what it was before it was turned.
+    pub(crate) fn turn_back(&mut self) {
+        for (at, part) in self.unturned.drain(..) {
+            self.jacobian[at..at + 3].copy_from_slice(&part.0);
+        }
     }
 
     /// Wrenches of loops at the configuration of the last [`Closure::evaluate`], where there are some.

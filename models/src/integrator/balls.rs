@@ -147,11 +147,13 @@ impl Workspace {
     }
 
     /// Moves ball joints to the end of the increment.
-    pub(crate) fn turn_to_end(&mut self, model: &Model) {
+    pub(crate) fn turn_to_end(&mut self, model: &Model, state: &PreciseState) {
         for (o, &i) in model.orientations.iter().enumerate() {
             if i < model.dimensions.dynamic {
                 let turn = three(&self.step.increment, i);
-                self.balls.end[o] = self.balls.start[o].times(&rotation::exp(turn));
+                let (end, _) = state.orientations[o].turned(state.orientations_low[o], turn);
+                self.step.q_end[i..i + 3].copy_from_slice(&end.log().0);
+                self.balls.end[o] = end.matrix();
             }
         }
     }
@@ -259,15 +261,16 @@ impl Workspace {
         }
     }
 
-    /// Turns the constraint Jacobian at the end into one by the increment.
+    /// Turns the constraint Jacobian at the end into one by the increment, if it is not.
     pub(crate) fn turn_end_jacobian(&mut self, model: &Model) {
         let (n, nd) = (model.dimensions.coordinates(), model.dimensions.dynamic);
+        let end = &mut self.constraints.end;
+        if end.is_turned() {
+            return;
+        }
         for &i in model.orientations.iter().filter(|i| **i < nd) {
             let to_end = rotation::dexp(three(&self.step.increment, i));
-            for row in self.constraints.end.jacobian.chunks_exact_mut(n) {
-                let turned = to_end.apply_transposed(three(row, i));
-                row[i..i + 3].copy_from_slice(&turned.0);
-            }
+            end.turn(i, n, |part| to_end.apply_transposed(part));
         }
     }
 

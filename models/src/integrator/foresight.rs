@@ -15,12 +15,19 @@
 //!
 //! `p[k+1] = p[k] + h (τ + f)` has been found before the correction; what the correction makes of it is linear,
 //! with an error as small as what is left of the residual.
+//!
+//! The residual is linear in the multipliers. Constraints are evaluated where the correction leads, once more or
+//! for the last time: it is where the next step begins. Where they are next to singular, multipliers are large, and
+//! so is what rounding leaves of a correction: there nothing is foreseen.
 
 use plantd_math::scalar::Compared;
 use plantd_math::spatial::three;
 
+use crate::integrator::report::StepReport;
 use crate::integrator::settings::{ForceSplit, Settings};
+use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::Workspace;
+use crate::kkt::system::Estimates;
 use crate::lagrangian::arrangement::Planar;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::nudge::Nudge;
@@ -28,6 +35,9 @@ use crate::model::mechanism::Model;
 
 /// What may be left of the residual unseen, in units of its round-off, as it is estimated.
 const UNSEEN: f64 = 0.5;
+/// How much constraints may be violated, in units of round-off, and the least reciprocal condition estimate.
+const HELD: f64 = 1.0;
+const REGULAR: f64 = 1e-4;
 /// The same where the residual has fallen accordingly, and what may be expected from that. By itself the fall says
 /// little: what is linear falls at once, and hides what is not.
 const BORNE_OUT: f64 = 16.0;
@@ -75,12 +85,12 @@ impl<S: Compared> Strayed<S> {
 }
 
 impl Model {
-    /// Whether bodies, with damping, armatures and inputs on coordinates, are all there is.
+    /// Whether bodies, with constraints, damping, armatures and inputs on coordinates, are all there is.
     pub(crate) fn is_of_bodies(&self) -> bool {
-        self.constraints.is_empty() && self.forces.is_none() && self.potentials.springs.is_empty()
+        self.forces.is_none() && self.potentials.springs.is_empty()
     }
 
-    /// Whether the bodies are all there is: then the estimate holds, and the impulse has a derivative
+    /// Whether bodies are all there is: then the estimate holds, and the impulse has a derivative
     /// that is as cheap as a correction.
     pub(crate) fn is_foreseen(&self, settings: &Settings) -> bool {
         self.is_of_bodies()
@@ -129,6 +139,29 @@ impl Workspace {
         let unit = f64::EPSILON * self.residual.round_off * settings.time_step_s.abs();
         let (corrections, inertia) = (&self.residual.dynamics, &model.conditioning.inertia);
         strayed.left(corrections, &self.step.increment, inertia, unit)
+    }
+
+    /// Whether the constraints hold where the last correction leads; if they do, what the next step begins with is
+    /// found, too.
+    pub(crate) fn holds_constraints(
+        &mut self,
+        model: &Model,
+        state: &PreciseState,
+        report: &mut StepReport,
+    ) -> bool {
+        if model.dimensions.constraints == 0 {
+            return true;
+        }
+        let Estimates { constraints, redundant, .. } = self.kkt.estimates;
+        if constraints < REGULAR || redundant > 0 {
+            return false;
+        }
+        report.constraint_residual = self.evaluate_end(model, state);
+        let holds = report.constraint_residual <= HELD;
+        if holds {
+            self.constraints.end.begin(model, &self.step.q_end);
+        }
+        holds
     }
 
     /// Moves the impulse on by the last correction, at the last factorization.

@@ -36,9 +36,7 @@ impl Workspace {
         self.factor_newton_matrix(model, settings)?;
         if model.dimensions.constraints > 0 {
             self.constraints.end.differentiate(model, &self.step.q_end);
-            if !model.orientations.is_empty() {
-                self.turn_end_jacobian(model);
-            }
+            self.turn_end_jacobian(model);
             self.factor_schur(model, settings)?;
         }
         Ok(())

@@ -8,6 +8,7 @@
 use plantd_math::norms::{larger, largest};
 use plantd_math::scalar::Compared;
 
+use crate::constraints::closure::Known;
 use crate::integrator::foresight::{Strayed, is_negligible};
 use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::settings::{Precision, Settings};
@@ -167,15 +168,15 @@ impl Workspace {
     fn place_start(&mut self, model: &Model, state: &PreciseState) {
         if self.constraints.start.in_plane.is_none() {
             self.prepare_start(model, state);
-        } else if !self.constraints.start.is_complete {
+        } else if self.constraints.start.known < Known::Place {
             self.constraints.start.evaluate(model, &state.q, &self.balls.start);
-            self.constraints.start.place_in_plane(model, &state.q);
+            self.constraints.start.begin(model, &state.q);
         }
     }
 
     /// Constraints at the start of the step, with their Jacobian.
     pub(crate) fn prepare_start(&mut self, model: &Model, state: &PreciseState) {
-        if model.dimensions.constraints > 0 && !self.constraints.start.is_complete {
+        if model.dimensions.constraints > 0 && self.constraints.start.known < Known::All {
             for (matrix, q) in self.balls.start.iter_mut().zip(&state.orientations) {
                 *matrix = q.matrix();
             }
@@ -309,7 +310,9 @@ impl Workspace {
             if let Some(strayed) = &mut strayed {
                 let left = self.foresee(model, settings, strayed);
                 let expected = chord.expected();
-                if is_negligible(left, expected) {
+                if is_negligible(left, expected)
+                    && self.holds_constraints(model, state, &mut report)
+                {
                     report.residual = left.min(expected);
                     self.step.is_evaluated = false;
                     break;
@@ -326,7 +329,7 @@ impl Workspace {
     }
 
     /// Constraint values `r2` at the current increment; returns their size in units of round-off.
-    fn evaluate_end(&mut self, model: &Model, state: &PreciseState) -> f64 {
+    pub(crate) fn evaluate_end(&mut self, model: &Model, state: &PreciseState) -> f64 {
         if model.dimensions.constraints == 0 {
             return 0.0;
         }
@@ -340,7 +343,7 @@ impl Workspace {
             self.step.q_end[i] = state.q[i] + (state.q_low[i] + x);
         }
         if !model.orientations.is_empty() {
-            self.turn_to_end(model);
+            self.turn_to_end(model, state);
         }
     }
 
@@ -392,13 +395,14 @@ impl Workspace {
 
     /// Constraints with Jacobian at the solution, for the linearization and the next step.
     pub(crate) fn finish_end(&mut self, model: &Model, state: &PreciseState) {
-        if model.dimensions.constraints > 0 && !self.constraints.end.is_complete {
+        if model.dimensions.constraints == 0 {
+            return;
+        }
+        if self.constraints.end.known < Known::All {
             self.place_end(model, state);
             self.constraints.end.complete(model, &self.step.q_end, &self.balls.end);
-            if !model.orientations.is_empty() {
-                self.turn_end_jacobian(model);
-            }
         }
+        self.turn_end_jacobian(model);
     }
 }
 

@@ -33,8 +33,8 @@ impl Point {
     /// Of the plants of a model.
     pub(crate) fn of(model: &Model) -> Self {
         let Dimensions { dynamic, prescribed, .. } = model.dimensions;
-        let is_in_space = model.planar.is_none();
-        let pushes = is_in_space && model.is_of_bodies() && !model.coordinate_inputs.is_empty();
+        let is_free = model.planar.is_none() && model.constraints.is_empty();
+        let pushes = is_free && model.is_of_bodies() && !model.coordinate_inputs.is_empty();
         let length = Self::length(dynamic, prescribed, model.orientations.len());
         if pushes { Self::zeros(length) } else { Self::default() }
     }

@@ -2,7 +2,7 @@
 
 use plantd_math::rows::{Term, padded, spread};
 
-use crate::constraints::closure::Closure;
+use crate::constraints::closure::{Closure, Known};
 use crate::integrator::balls::BallJoints;
 use crate::integrator::midpoint::Midpoint;
 use crate::integrator::response::Response;
@@ -76,20 +76,17 @@ pub(crate) struct ConstraintPair {
 }
 
 impl ConstraintPair {
-    /// The end of this step is the start of the next; a Jacobian by the increments of ball joints is not.
-    pub(crate) fn move_on(&mut self, has_balls: bool) {
-        if self.end.is_complete && !has_balls {
-            std::mem::swap(&mut self.start, &mut self.end);
-            self.end.is_complete = false;
-        } else {
-            self.forget();
-        }
+    /// The end of this step is the start of the next.
+    pub(crate) fn move_on(&mut self) {
+        self.end.turn_back();
+        std::mem::swap(&mut self.start, &mut self.end);
+        self.end.known = Known::Nothing;
     }
 
     /// The state has changed: nothing of the last step holds.
     pub(crate) fn forget(&mut self) {
-        self.start.is_complete = false;
-        self.end.is_complete = false;
+        self.start.known = Known::Nothing;
+        self.end.known = Known::Nothing;
     }
 }
 
@@ -153,7 +150,7 @@ impl Workspace {
 
     /// The end of this step is the start of the next.
     pub(crate) fn move_on(&mut self) {
-        self.constraints.move_on(!self.balls.turns.is_empty());
+        self.constraints.move_on();
         self.response.move_on(&mut self.kkt);
     }
 }
