@@ -43,7 +43,7 @@ impl Model {
         let plan = self.loops.as_ref().map(|loops| &loops.plan);
         let (fronts, rows) = plan.map_or((0.0, 0.0), |plan| (plan.work(), plan.rows() as f64));
         let (factorization, correction) = match self.solver {
-            Solver::Tree => {
+            Solver::Tree | Solver::Held => {
                 (generators * joints + 60.0 * entries + 24.0 * changes, 110.0 + 27.0 * entries)
             }
             Solver::Planar => (100.0 + 340.0 * joints, 110.0 + 88.0 * joints),
@@ -84,6 +84,8 @@ impl Model {
             if plan.is_some() {
                 stages.push(stage("their wrenches", 2.1, 310.0 * joints));
                 linearization += factorization + 15.0 * rows * columns;
+            } else if self.held.is_some() {
+                stages.push(stage("their Jacobian", 2.0, jacobian));
             } else {
                 stages.push(stage("their Jacobian", 2.0, jacobian));
                 stages.push(stage("their factorization", 1.1, schur));

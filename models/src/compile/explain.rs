@@ -60,6 +60,15 @@ impl Model {
                 self.elimination.entries(),
                 d.dynamic * (d.dynamic + 1) / 2,
             ),
+            Solver::Held => {
+                let limbs = self.held.iter().flat_map(|held| &held.limbs);
+                let rows = limbs.clone().map(|limb| limb.coordinates.len()).sum::<usize>();
+                format!(
+                    "factorization {} limbs with their constraints, {} coordinates tree-sparse",
+                    limbs.count(),
+                    d.dynamic - rows,
+                )
+            }
             Solver::Loops => {
                 let plan = self.loops.as_ref().map(|loops| &loops.plan);
                 let most = plan.and_then(|plan| plan.fronts.iter().max()).copied().unwrap_or(0);

@@ -365,7 +365,7 @@ impl Model {
             let (joints, weight) = (self.planar.as_ref()?, &self.conditioning.weight);
             let loops = Loops::new(joints, &self.constraints, &self.closure, weight, spare, work)?;
             self.take_loops(loops);
-            let are_sound = Workspace::new(self).can_eliminate_loops(self);
+            let are_sound = Workspace::new(self).can_eliminate_constraints(self);
             self.loops.take().filter(|_| are_sound)
         });
         self.solver = solver;

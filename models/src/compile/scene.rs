@@ -124,6 +124,7 @@ fn assemble(scene: &Scene, layout: Layout) -> Model {
         planar,
         straightened: layout.straightened,
         loops: None,
+        held: None,
         gravity,
         damping,
         coordinate_inputs: layout.coordinate_inputs(scene),
@@ -147,6 +148,7 @@ fn assemble(scene: &Scene, layout: Layout) -> Model {
     model.initial_violations = model.violations_at_start();
     model.conditioning = Conditioning::new(&model);
     model.find_loops();
+    model.find_held();
     pattern::check(&model);
     model
 }

@@ -10,6 +10,7 @@ use crate::kkt::system::{Factors, Linearized};
 use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::turning::Weights;
+use crate::model::manifold::orientations;
 use crate::model::mechanism::{Forces, Model};
 
 impl Workspace {
@@ -24,6 +25,8 @@ impl Workspace {
         let has_loops = self.constraints.end.in_plane.is_some();
         if has_loops {
             self.constraints.end.place_in_plane(model, &self.step.q_end);
+        } else if model.dimensions.constraints > 0 {
+            self.differentiate_end(model);
         }
         if self.factor_recursion(model, settings)? {
             return Ok(());
@@ -32,27 +35,33 @@ impl Workspace {
             // By all joints together what is singular may not be, and if it is it gets its name.
             self.constraints.start.differentiate(model, &state.q);
             self.constraints.start.place_in_plane(model, &state.q);
+            self.differentiate_end(model);
         }
         self.factor_newton_matrix(model, settings)?;
         if model.dimensions.constraints > 0 {
-            self.constraints.end.differentiate(model, &self.step.q_end);
-            self.turn_end_jacobian(model);
             self.factor_schur(model, settings)?;
         }
         Ok(())
     }
 
-    /// Whether the pivots of loops are sound at rest, where the constraints are known to be regular.
-    pub(crate) fn can_eliminate_loops(&mut self, model: &Model) -> bool {
+    /// The constraint Jacobian at the end, by the increment.
+    fn differentiate_end(&mut self, model: &Model) {
+        self.constraints.end.differentiate(model, &self.step.q_end);
+        self.turn_end_jacobian(model);
+    }
+
+    /// Whether the pivots of constraints are sound at rest, where they are known to be regular.
+    pub(crate) fn can_eliminate_constraints(&mut self, model: &Model) -> bool {
         let q = &model.conditioning.regular;
+        let orientations = orientations(model, q);
         for (closure, q_there) in [
             (&mut self.constraints.start, &mut self.mid.q),
             (&mut self.constraints.end, &mut self.step.q_end),
         ] {
             q_there.copy_from_slice(q);
-            closure.evaluate(model, q, &[]);
-            closure.place_in_plane(model, q);
+            closure.complete(model, q, &orientations);
         }
+        self.mid.orientations.copy_from_slice(&orientations);
         self.mid.angles.copy_from_slice(q);
         self.mid.evaluate(model);
         matches!(self.factor_recursion(model, &Settings::new(model)), Ok(true))
@@ -68,9 +77,13 @@ impl Workspace {
         if !self.kkt.has_recursion() {
             return Ok(false);
         }
-        self.mid.fill_diagonal(model, settings, &mut self.kkt.diagonal);
-        if !model.orientations.is_empty() {
-            self.weigh_balls(model, settings);
+        if model.held.is_some() {
+            self.fill_newton_matrix(model, settings);
+        } else {
+            self.mid.fill_diagonal(model, settings, &mut self.kkt.diagonal);
+            if !model.orientations.is_empty() {
+                self.weigh_balls(model, settings);
+            }
         }
         let constraints = [&self.constraints.start, &self.constraints.end];
         let at = linearized(model, settings, &mut self.mid.mechanics, constraints);

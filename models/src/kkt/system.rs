@@ -11,6 +11,7 @@
 use plantd_math::tree_lu::{SmallestPivot, TreeLu};
 
 use crate::constraints::closure::Closure;
+use crate::kkt::held::HeldLimbs;
 use crate::kkt::loops::{Mechanism, Multifrontal, Scales};
 use crate::kkt::planar::PlanarRecursion;
 use crate::kkt::schur::SchurComplement;
@@ -46,7 +47,7 @@ pub(crate) struct Factored {
     pub(crate) valid: Factors,
 }
 
-/// Factors in O(n), in place of the tree LU.
+/// Factors that take the place of the tree LU, or of most of it.
 #[derive(Clone, Debug, Default)]
 pub(crate) enum Recursion {
     #[default]
@@ -55,6 +56,8 @@ pub(crate) enum Recursion {
     /// With the constraints.
     Loops(Box<Multifrontal>),
     Spatial(Box<SpatialRecursion>),
+    /// Limbs with the constraints, and the tree LU of what they leave.
+    Held(Box<HeldLimbs>),
 }
 
 /// Which factors are valid.
@@ -92,6 +95,10 @@ impl Factored {
                 Recursion::Planar(Box::new(PlanarRecursion::new(model.dimensions.dynamic)))
             }
             (Solver::Loops, Some(loops)) => Recursion::Loops(Box::new(Multifrontal::new(loops))),
+            (Solver::Held, _) => match &model.held {
+                Some(held) => Recursion::Held(Box::new(HeldLimbs::new(held))),
+                None => Recursion::None,
+            },
             (Solver::Spatial, _) => {
                 let recursion = SpatialRecursion::new(model);
                 Recursion::Spatial(Box::new(recursion))
@@ -125,7 +132,7 @@ impl KktSystem {
     }
 
     /// Factors by the recursion: false where there is none or its pivots are not sound, and the tree has to
-    /// do. The error is a pivot that is too small. Of masses alone all pivots of trees are taken.
+    /// do. Of limbs that are held `K` is filled. The error is a pivot that is too small. Of masses alone all pivots of trees are taken.
     pub(crate) fn factor_recursion(
         &mut self,
         at: Linearized<'_>,
@@ -134,47 +141,60 @@ impl KktSystem {
         let Linearized { model, mechanics, constraints, time_step_s, singular_below } = at;
         let (conditioning, diagonal) = (&model.conditioning, &self.diagonal);
         let inertia = &conditioning.inertia;
-        self.factored.valid = Factors::Tree;
-        let pivot =
-            match (&mut self.factored.recursion, mechanics.planar.as_deref_mut(), &model.planar) {
-                (Recursion::Planar(recursion), Some(PlanarTree::Many(tree)), Some(joints)) => {
-                    tree.differentiate(joints);
-                    recursion.factor(tree, joints, diagonal, inertia, time_step_s, kind)
-                }
-                (Recursion::Loops(fronts), Some(PlanarTree::Many(tree)), Some(joints)) => {
-                    let [start, end] = constraints.map(|closure| closure.in_plane.as_deref());
-                    let (Some(loops), Some(start), Some(end)) = (&model.loops, start, end) else {
-                        return Ok(false);
-                    };
-                    tree.differentiate(joints);
-                    let at = Mechanism { loops, joints, tree, start, end };
-                    let scales = Scales { inertia, weight: &conditioning.weight };
-                    let pivots = fronts.factor(at, diagonal, scales, time_step_s, kind);
-                    if pivots.joints.relative < SAFE
-                        || pivots.equations < SAFE
-                        || pivots.steepness < singular_below
-                    {
-                        return Ok(false);
-                    }
-                    self.factored.valid = Factors::Recursion;
-                    self.estimates = Estimates {
-                        matrix: pivots.joints.relative,
-                        constraints: pivots.equations.min(pivots.steepness),
-                        redundant: (model.constraints.len() - loops.equations.len()) as u32,
-                    };
-                    return Ok(true);
-                }
-                (Recursion::Spatial(recursion), ..) => {
-                    mechanics.differentiate(model);
-                    let added = Added { diagonal, balls: &self.balls };
-                    let curvature = &mechanics.curvature;
-                    recursion.factor(model, curvature, added, time_step_s, kind)
-                }
-                (Recursion::None | Recursion::Planar(_) | Recursion::Loops(_), ..) => {
+        let Factored { tree: matrix, recursion, valid } = &mut self.factored;
+        *valid = Factors::Tree;
+        let pivot = match (recursion, mechanics.planar.as_deref_mut(), &model.planar) {
+            (Recursion::Planar(recursion), Some(PlanarTree::Many(tree)), Some(joints)) => {
+                tree.differentiate(joints);
+                recursion.factor(tree, joints, diagonal, inertia, time_step_s, kind)
+            }
+            (Recursion::Loops(fronts), Some(PlanarTree::Many(tree)), Some(joints)) => {
+                let [start, end] = constraints.map(|closure| closure.in_plane.as_deref());
+                let (Some(loops), Some(start), Some(end)) = (&model.loops, start, end) else {
+                    return Ok(false);
+                };
+                tree.differentiate(joints);
+                let at = Mechanism { loops, joints, tree, start, end };
+                let scales = Scales { inertia, weight: &conditioning.weight };
+                let pivots = fronts.factor(at, diagonal, scales, time_step_s, kind);
+                if pivots.joints.relative < SAFE
+                    || pivots.equations < SAFE
+                    || pivots.steepness < singular_below
+                {
                     return Ok(false);
                 }
-            };
-        self.factored.valid = Factors::Recursion;
+                *valid = Factors::Recursion;
+                self.estimates = Estimates {
+                    matrix: pivots.joints.relative,
+                    constraints: pivots.equations.min(pivots.steepness),
+                    redundant: (model.constraints.len() - loops.equations.len()) as u32,
+                };
+                return Ok(true);
+            }
+            (Recursion::Held(limbs), ..) => {
+                let (Some(held), MatrixKind::Newton) = (&model.held, kind) else {
+                    return Ok(false);
+                };
+                let pivots = limbs.factor(model, held, matrix, constraints, time_step_s);
+                let Some(pivot) = pivots.rest.filter(|pivot| pivot.relative >= SAFE) else {
+                    return Ok(false);
+                };
+                *valid = Factors::Recursion;
+                let (matrix, constraints) = (pivot.relative, pivots.equations);
+                self.estimates = Estimates { matrix, constraints, redundant: 0 };
+                return Ok(true);
+            }
+            (Recursion::Spatial(recursion), ..) => {
+                mechanics.differentiate(model);
+                let added = Added { diagonal, balls: &self.balls };
+                let curvature = &mechanics.curvature;
+                recursion.factor(model, curvature, added, time_step_s, kind)
+            }
+            (Recursion::None | Recursion::Planar(_) | Recursion::Loops(_), ..) => {
+                return Ok(false);
+            }
+        };
+        *valid = Factors::Recursion;
         if kind == MatrixKind::Mass {
             Ok(true)
         } else {
@@ -237,6 +257,11 @@ impl KktSystem {
             }
             (Recursion::Spatial(recursion), Factors::Recursion, _) => {
                 recursion.solve(x);
+            }
+            (Recursion::Held(limbs), Factors::Recursion, _) => {
+                if let Some(held) = &model.held {
+                    limbs.solve(held, x, lambda);
+                }
             }
             _ => {
                 self.factored.tree.solve(&model.elimination, x);

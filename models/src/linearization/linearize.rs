@@ -145,8 +145,8 @@ pub(crate) struct SolvedStep {
     pub(crate) responses: Vec<f64>,
     /// The factors of `S`.
     pub(crate) schur: PivotedLu,
-    /// Loops were eliminated without these two.
-    pub(crate) in_loops: bool,
+    /// Constraints were eliminated without these two.
+    pub(crate) without_schur: bool,
 }
 
 impl SolvedStep {
@@ -164,7 +164,7 @@ impl SolvedStep {
             multipliers: zeros(d.constraints),
             responses: zeros(d.dynamic * padded(d.constraints)),
             schur: room_for_schur(model, 1),
-            in_loops: false,
+            without_schur: false,
         }
     }
 
@@ -188,8 +188,8 @@ impl SolvedStep {
         }
         if !self.multipliers.is_empty() {
             self.multipliers.copy_from_slice(&workspace.step.multipliers);
-            self.in_loops = workspace.kkt.factored.valid == Factors::Recursion;
-            if !self.in_loops {
+            self.without_schur = workspace.kkt.factored.valid == Factors::Recursion;
+            if !self.without_schur {
                 self.responses.copy_from_slice(&workspace.kkt.schur.responses);
                 self.schur.take_factors_of(&workspace.kkt.schur.lu);
             }

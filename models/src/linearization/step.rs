@@ -29,6 +29,7 @@ impl Workspace {
         let is_done = match self.kkt.factored.recursion {
             Recursion::Planar(_) => self.linearize_planar(at, out)?,
             Recursion::Loops(_) => self.linearize_loops(at, out)?,
+            Recursion::Held(_) => self.linearize_held(at, out)?,
             Recursion::None | Recursion::Spatial(_) => false,
         };
         if is_done {
@@ -55,6 +56,7 @@ impl Workspace {
             self.prepare_start(at.model, at.state);
             self.finish_end(at.model, at.state);
             self.factor_schur(at.model, at.settings)?;
+            self.fill_closing(at, out);
             self.solve_multipliers(at, out);
         }
         self.differentiate_momentum(at, out);
@@ -147,6 +149,30 @@ impl Workspace {
         };
         let mechanism = loops::Mechanism { loops, joints, tree, start, end };
         fronts.linearize(mechanism, &diagonal, &closures, derivatives);
+        Ok(true)
+    }
+
+    /// Linearizes with limbs that are held, where their pivots allow it.
+    fn linearize_held(
+        &mut self,
+        at: StepContext<'_>,
+        out: &mut Linearization,
+    ) -> Result<bool, StepError> {
+        let StepContext { model, settings, state, .. } = at;
+        self.prepare_start(model, state);
+        self.finish_end(model, state);
+        if !self.factor_recursion(model, settings)? {
+            return Ok(false);
+        }
+        self.fill_right_hand_sides(at, out);
+        self.fill_closing(at, out);
+        let (Recursion::Held(limbs), Some(held)) = (&mut self.kkt.factored.recursion, &model.held)
+        else {
+            return Ok(false);
+        };
+        let lengths = [out.stride, padded(out.next_columns())];
+        limbs.solve_rows(held, &mut out.increment, &mut out.multipliers, lengths);
+        self.differentiate_momentum(at, out);
         Ok(true)
     }
 
@@ -326,24 +352,34 @@ impl Workspace {
         }
     }
 
-    /// From `K⁻¹ r1'` in `out.increment`: solves `S λ' = A1 K⁻¹ r1' − r2'` and subtracts `K⁻¹ A0ᵀ λ'`.
-    fn solve_multipliers(&mut self, at: StepContext<'_>, out: &mut Linearization) {
-        let model = at.model;
-        let d = model.dimensions;
-        let (n, nd, nc, stride) = (d.coordinates(), d.dynamic, d.constraints, out.stride);
-        let next = out.next_columns();
-        for (c, constraint) in model.constraints.iter().enumerate() {
-            let jacobian = &self.constraints.end.jacobian[c * n..][..n];
-            let target = &mut out.multipliers[c * stride..][..stride];
+    /// Writes `r2'` into `out.multipliers`.
+    fn fill_closing(&self, at: StepContext<'_>, out: &mut Linearization) {
+        let d = at.model.dimensions;
+        let (n, nd, next) = (d.coordinates(), d.dynamic, out.next_columns());
+        let rows = out.multipliers.chunks_exact_mut(out.stride.max(1));
+        for (target, jacobian) in rows.zip(self.constraints.end.jacobian.chunks_exact(n.max(1))) {
             target.fill(0.0);
-            target.iter_mut().zip(&jacobian[..nd]).for_each(|(t, entry)| *t = -entry);
+            target[..nd].copy_from_slice(&jacobian[..nd]);
             for turning in out.turnings.iter().filter(|turning| turning.coordinate < nd) {
                 // From the columns of `ξ`, by dexp₋ξ, to those of the start: exp(−ξ) = dexp₋ξ N⁺.
                 let i = turning.coordinate;
                 let carried = turning.momentum.apply(three(target, i));
                 target[i..i + 3].copy_from_slice(&carried.0);
             }
-            target[next..].iter_mut().zip(&jacobian[nd..]).for_each(|(t, entry)| *t = -entry);
+            target[next..].iter_mut().zip(&jacobian[nd..]).for_each(|(t, entry)| *t = *entry);
+        }
+    }
+
+    /// From `K⁻¹ r1'` in `out.increment` and `r2'` in `out.multipliers`: solves `S λ' = A1 K⁻¹ r1' − r2'` and
+    /// subtracts `K⁻¹ A0ᵀ λ'`.
+    fn solve_multipliers(&mut self, at: StepContext<'_>, out: &mut Linearization) {
+        let model = at.model;
+        let d = model.dimensions;
+        let (n, nc, stride) = (d.coordinates(), d.constraints, out.stride);
+        for (c, constraint) in model.constraints.iter().enumerate() {
+            let jacobian = &self.constraints.end.jacobian[c * n..][..n];
+            let target = &mut out.multipliers[c * stride..][..stride];
+            target.iter_mut().for_each(|entry| *entry = -*entry);
             let dynamic = constraint.dynamic_coordinates().iter();
             self.tangents.terms.clear();
             self.tangents.terms.extend(dynamic.map(|&i| (jacobian[i], i)));

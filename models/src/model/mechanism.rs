@@ -6,6 +6,7 @@ use plantd_math::spline::Spline;
 use plantd_scene::{CoordinateKind, Problem, Scene};
 
 use crate::model::conditioning::Conditioning;
+use crate::model::held::Held;
 use crate::model::loop_plan::Loops;
 use crate::model::planar_tree::{PlanarJoint, PlanarJoints};
 use crate::model::signal::{Signal, Target};
@@ -31,6 +32,8 @@ pub struct Model {
     pub(crate) straightened: (usize, f64),
     /// Its loops, where they are eliminated with it.
     pub(crate) loops: Option<Loops>,
+    /// Its limbs whose ends are held, where they are eliminated first.
+    pub(crate) held: Option<Held>,
     /// How a step solves for corrections.
     pub(crate) solver: Solver,
     /// `None` without gravity.
@@ -73,6 +76,8 @@ pub struct Violation {
 pub(crate) enum Solver {
     /// Entry by entry along the elimination tree: O(n·depth²) once, O(n·depth) for each correction.
     Tree,
+    /// The same of all but limbs whose ends are held, which are eliminated with the constraints.
+    Held,
     /// By the vectors that generate the entries: O(n). In planes, or in space.
     Planar,
     Spatial,

@@ -6,6 +6,7 @@
 //! measured against, [`signal`] functions of time, [`site`] points of frames.
 
 pub(crate) mod conditioning;
+pub(crate) mod held;
 pub(crate) mod loop_plan;
 pub(crate) mod manifold;
 pub(crate) mod mechanism;

@@ -51,7 +51,7 @@ pub struct Contraction {
     impulse: Vec<f64>,
     pub(super) quadratic: Quadratic,
     schur: PivotedLu,
-    /// Where loops are eliminated: what a linearization of them leaves out.
+    /// Where constraints are eliminated with joints: what a linearization of them leaves out.
     dense: Option<Dense>,
     /// Constraints at `q[k+1]`.
     end: Closure,
@@ -180,7 +180,7 @@ impl Contraction {
             impulse: vec![0.0; n],
             quadratic: Quadratic::new(layout),
             schur: room_for_schur(model, 1),
-            dense: model.loops.as_ref().map(|_| Dense {
+            dense: (model.loops.is_some() || model.held.is_some()).then(|| Dense {
                 matrix: TreeLu::new(&model.elimination),
                 responses: vec![0.0; layout.nd * padded(layout.nc)],
             }),
@@ -258,38 +258,35 @@ impl Contraction {
         }
     }
 
-    /// `K⁻¹ A0ᵀ` and the factors of `S`, where loops were eliminated without them.
-    fn find_responses(&mut self, model: &Model, step: &SolvedStep) {
+    /// `K⁻¹ A0ᵀ` and the factors of `S`, where constraints were eliminated without them: of the entries of `K`, and
+    /// the Jacobian at the end.
+    fn find_responses(
+        &mut self,
+        model: &Model,
+        step: &SolvedStep,
+        entry: impl Fn(&StepBlocks<Dual>, usize, usize) -> f64,
+    ) {
         let Some(Dense { matrix, responses }) = &mut self.dense else { return };
         let Parameters { nd, nc, .. } = self.scratch.layout;
         let (n, stride) = (self.scratch.layout.n(), padded(nc));
-        let (h, a) = (step.settings.time_step_s, step.settings.force_split.at_start());
-        let StepBlocks { mid, start, .. } = &self.scratch.blocks;
+        let h = step.settings.time_step_s;
+        let blocks = &self.scratch.blocks;
         let elimination = &model.elimination;
         matrix.clear();
         for i in 0..nd {
             let slots = elimination.offsets[i]..elimination.offsets[i + 1];
             for &j in &elimination.ancestors[slots] {
-                let entry = |ij: usize, ji: usize| {
-                    let turning = 0.5 * (mid.l_qv[ij].re - mid.l_qv[ji].re);
-                    0.25 * h * mid.l_qq[ij].re - mid.l_vv[ij].re / h + turning
-                };
-                let (ij, ji) = (i * n + j, j * n + i);
-                if i == j {
-                    matrix.add(elimination, i, i, entry(ij, ij) + a * mid.f_v[ij].re);
-                } else {
-                    matrix.add(elimination, i, j, entry(ij, ji));
-                    matrix.add(elimination, j, i, entry(ji, ij));
+                matrix.add(elimination, i, j, entry(blocks, i, j));
+                if i != j {
+                    matrix.add(elimination, j, i, entry(blocks, j, i));
                 }
             }
             for c in 0..nc {
-                responses[i * stride + c] = start.jacobian[c * n + i].re;
+                responses[i * stride + c] = blocks.start.jacobian[c * n + i].re;
             }
         }
         matrix.factor(elimination, &model.conditioning.inertia, 1.0 / h.abs());
         matrix.solve_rows(elimination, responses, stride, stride);
-        self.end.evaluate(model, &self.q_end, &[]);
-        self.end.differentiate(model, &self.q_end);
         fill_schur(model, &self.end, responses, &mut self.schur);
         self.schur.factor();
     }
@@ -306,7 +303,7 @@ impl Contraction {
         let blocks = &self.scratch.blocks;
         let z_p = &z[n..][..nd];
         let responses = match &self.dense {
-            Some(dense) if step.in_loops => &dense.responses,
+            Some(dense) if step.without_schur => &dense.responses,
             _ => {
                 self.schur.take_factors_of(&step.schur);
                 &step.responses
@@ -335,6 +332,13 @@ impl Contraction {
         if nc > 0 {
             self.scratch.seed(0, model, step);
             self.scratch.blocks.evaluate(model, &step.settings);
+            if step.without_schur {
+                let [_, by_next] = self.scratch.blocks.end_jacobians();
+                for (to, from) in self.end.jacobian.iter_mut().zip(by_next) {
+                    *to = from.re;
+                }
+                self.find_responses(model, step, |blocks, i, j| blocks.residual_next[i * n + j].re);
+            }
             self.find_multipliers(step, z, |blocks, i, j| blocks.momentum_next[i * n + j].re);
         }
         self.quadratic.clear();
@@ -479,8 +483,16 @@ impl Contraction {
         for (i, q) in step.q.iter().enumerate() {
             self.q_end[i] = if i < nd { q + step.increment[i] } else { step.next[i - nd] };
         }
-        if step.in_loops {
-            self.find_responses(model, step);
+        if step.without_schur {
+            self.end.evaluate(model, &self.q_end, &[]);
+            self.end.differentiate(model, &self.q_end);
+            let a = step.settings.force_split.at_start();
+            self.find_responses(model, step, |StepBlocks { mid, .. }, i, j| {
+                let (ij, ji) = (i * n + j, j * n + i);
+                let turning = 0.5 * (mid.l_qv[ij].re - mid.l_qv[ji].re);
+                let force = if i == j { a * mid.f_v[ij].re } else { 0.0 };
+                0.25 * h * mid.l_qq[ij].re - mid.l_vv[ij].re / h + turning + force
+            });
         }
         self.find_multipliers(step, z, |blocks, i, j| {
             let slope = 0.5 * h * blocks.mid.l_qq[i * n + j].re + blocks.mid.l_qv[i * n + j].re;

@@ -1,0 +1,624 @@
+//! Limbs whose ends are held, such as legs on the ground, eliminated with the equations that hold them.
+//!
+//! As many equations as the last coordinates `l` of a chain, which depend on no others but those above, `b`, say
+//! where the limb goes with what carries it. With the blocks `A1_l` and `A0_l` of the Jacobians,
+//!
+//! ```text
+//! K y + A0ᵀ λ = r1                     G1 = A1_l⁻¹ A1_b      G0 = A0_l⁻¹ A0_b
+//! A1 y        = r2                     E = K_lb − K_ll G1
+//!
+//! c = A1_l⁻¹ r2                        s = r_l − K_ll c
+//! (K_bb − K_bl G1 − G0ᵀ E) y_b = r_b − K_bl c − G0ᵀ s
+//! y_l = c − G1 y_b                     λ = A0_l⁻ᵀ (s − E y_b)
+//! ```
+//!
+//! What is left is a matrix of the other coordinates, and no equation: the change of a limb stays among the rows of
+//! the chain that carries it. Where `A_l` is next to singular, as that of a straight leg, all equations are taken
+//! together.
+
+#[cfg(test)]
+mod tests;
+
+use plantd_math::eights::{Eight, InEights, in_eights};
+use plantd_math::rows::{Block, LANES};
+use plantd_math::spatial::Vec3;
+use plantd_math::tree_lu::{SmallestPivot, TreeLu};
+
+use crate::constraints::closure::Closure;
+use crate::model::held::{Held, HeldLimb};
+use crate::model::mechanism::Model;
+
+/// Equations of a limb, at most.
+pub(crate) const MOST: usize = 6;
+/// One over the largest entry of `A_l⁻¹`, in units in which the steepest equation has slope 1, from which on it is
+/// taken.
+const SOUND: f64 = 1e-3;
+
+/// Rows and columns of a limb.
+type Square<const N: usize> = [[f64; N]; N];
+
+/// The factors of a limb with up to `N` equations; those that it does not have are `y = r2`.
+#[derive(Clone, Debug)]
+struct Factors<const N: usize> {
+    /// `A0_l⁻¹` and `A1_l⁻¹`.
+    inverses: [Square<N>; 2],
+    /// `K_ll`.
+    own: Square<N>,
+    /// By the coordinates above, eight at a time.
+    above: Vec<Above<N>>,
+}
+
+/// Rows of a limb, by eight of the coordinates above.
+#[derive(Clone, Copy, Debug)]
+struct Above<const N: usize> {
+    /// `G0` and `G1`.
+    start: [Block; N],
+    end: [Block; N],
+    /// `K_blᵀ` and `E`.
+    upper: [Block; N],
+    lower: [Block; N],
+}
+
+/// A limb, by what holds it.
+#[derive(Clone, Debug)]
+enum Limb {
+    /// A point.
+    Three(Factors<3>),
+    /// Anything else.
+    Six(Factors<MOST>),
+}
+
+/// The same for each kind of limb.
+macro_rules! of_limb {
+    ($limb:expr, $factors:ident => $result:expr) => {
+        match $limb {
+            Limb::Three($factors) => $result,
+            Limb::Six($factors) => $result,
+        }
+    };
+}
+
+/// Limbs eliminated, and factors of the rest.
+#[derive(Clone, Debug)]
+pub(crate) struct HeldLimbs {
+    limbs: Vec<Limb>,
+    rest: TreeLu,
+    /// What limbs that hang from the same coordinates make of these, in their rows and columns.
+    sums: Vec<Block>,
+}
+
+/// The smallest pivots of an elimination.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Pivots {
+    /// Of the coordinates that are left; none where a limb was not eliminated.
+    pub(crate) rest: Option<SmallestPivot>,
+    /// Of the equations.
+    pub(crate) equations: f64,
+}
+
+impl HeldLimbs {
+    pub(crate) fn new(held: &Held) -> Self {
+        let most = held.limbs.iter().map(|limb| limb.above.len()).max().unwrap_or_default();
+        let limb = |limb: &HeldLimb| match limb.equations.len() {
+            3 => Limb::Three(Factors::new(limb)),
+            _ => Limb::Six(Factors::new(limb)),
+        };
+        Self {
+            limbs: held.limbs.iter().map(limb).collect(),
+            rest: TreeLu::new(&held.rest),
+            sums: vec![Block::ZERO; most * most.div_ceil(LANES)],
+        }
+    }
+
+    /// Factors with `K`, which is filled, and the Jacobians at the start and the end.
+    #[inline(never)]
+    pub(crate) fn factor(
+        &mut self,
+        model: &Model,
+        held: &Held,
+        matrix: &TreeLu,
+        closures: [&Closure; 2],
+        step: f64,
+    ) -> Pivots {
+        self.take_rest(model, held, matrix);
+        let equations = in_eights(Eliminate { limbs: self, model, held, matrix, closures });
+        let scale = 1.0 / step.abs();
+        let is_sound = equations >= SOUND;
+        let rest = is_sound.then(|| self.rest.factor(&held.rest, &held.inertia, scale));
+        Pivots { rest, equations }
+    }
+
+    /// Solves in place: from `r1` and `r2` come `y` and `λ`.
+    #[inline(never)]
+    pub(crate) fn solve(&mut self, held: &Held, x: &mut [f64], lambda: &mut [f64]) {
+        in_eights(Lift { limbs: self, held, x, lambda });
+        self.rest.solve(&held.rest, x);
+        in_eights(Lower { limbs: self, held, x, lambda });
+    }
+
+    /// [`Self::solve`] for right-hand sides side by side, row-major; `columns` and `stride` are whole blocks.
+    #[inline(never)]
+    pub(crate) fn solve_rows(
+        &mut self,
+        held: &Held,
+        x: &mut [f64],
+        lambda: &mut [f64],
+        [stride, columns]: [usize; 2],
+    ) {
+        in_eights(LiftRows { limbs: self, held, x, lambda, stride, columns });
+        self.rest.solve_rows(&held.rest, x, stride, columns);
+        in_eights(LowerRows { limbs: self, held, x, lambda, stride, columns });
+    }
+
+    /// Takes the entries of `K` of which no coordinate is a limb's.
+    fn take_rest(&mut self, model: &Model, held: &Held, matrix: &TreeLu) {
+        let offsets = &model.elimination.offsets;
+        for (from, to) in offsets.windows(2).zip(held.rest.offsets.windows(2)) {
+            let (from, to) = (from[0]..from[1], to[0]..to[1]);
+            if from.len() == to.len() {
+                self.rest.upper[to.clone()].copy_from_slice(&matrix.upper[from.clone()]);
+                self.rest.lower[to].copy_from_slice(&matrix.lower[from]);
+            } else {
+                self.rest.upper[to].fill(1.0);
+            }
+        }
+    }
+
+    /// Adds what limbs make of the coordinates above them, and begins anew.
+    #[inline(always)]
+    fn put_sums(&mut self, plan: &HeldLimb, held: &Held) {
+        let width = plan.above.len().div_ceil(LANES);
+        let offsets = &held.rest.offsets;
+        for (d, &i) in plan.above.iter().enumerate() {
+            let row = &mut self.sums[d * width..][..width];
+            for (e, &k) in plan.above.iter().enumerate() {
+                let sum = row[e / LANES].0[e % LANES];
+                if e < d {
+                    self.rest.lower[offsets[i] + e] += sum;
+                } else {
+                    self.rest.upper[offsets[k] + d] += sum;
+                }
+            }
+            row.fill(Block::ZERO);
+        }
+    }
+}
+
+/// `Σ row · factor`.
+#[inline(always)]
+fn sum_of<E: Eight, const N: usize>(rows: &[E; N], factors: &[f64; N]) -> E {
+    let mut sum = rows[0].scaled(factors[0]);
+    for k in 1..N {
+        sum = sum.plus(rows[k].scaled(factors[k]));
+    }
+    sum
+}
+
+#[inline(always)]
+fn dot<const N: usize>(a: &[f64; N], b: &[f64; N]) -> f64 {
+    let mut sum = a[0] * b[0];
+    for k in 1..N {
+        sum += a[k] * b[k];
+    }
+    sum
+}
+
+#[inline(always)]
+fn loaded<E: Eight, const N: usize>(rows: &[Block; N]) -> [E; N] {
+    let mut numbers = [E::ZERO; N];
+    for k in 0..N {
+        numbers[k] = E::of(&rows[k]);
+    }
+    numbers
+}
+
+/// The inverse of a matrix by rows, if it has one.
+#[inline(always)]
+fn inverse<const N: usize>(mut matrix: Square<N>) -> Option<Square<N>> {
+    let mut inverse = [[0.0; N]; N];
+    if N == 3 {
+        let [a, b, c] = [0, 1, 2].map(|i| Vec3([matrix[i][0], matrix[i][1], matrix[i][2]]));
+        let columns = [b.cross(c), c.cross(a), a.cross(b)];
+        let determinant = a.dot(columns[0]);
+        let scale = 1.0 / determinant;
+        for (i, row) in inverse.iter_mut().enumerate() {
+            for (entry, column) in row.iter_mut().zip(columns) {
+                *entry = column[i] * scale;
+            }
+        }
+        return (determinant != 0.0 && determinant.is_finite()).then_some(inverse);
+    }
+    for (i, row) in inverse.iter_mut().enumerate() {
+        row[i] = 1.0;
+    }
+    for k in 0..N {
+        let larger = |best: usize, i: usize| {
+            if matrix[i][k].abs() > matrix[best][k].abs() { i } else { best }
+        };
+        let largest = (k..N).fold(k, larger);
+        matrix.swap(k, largest);
+        inverse.swap(k, largest);
+        let pivot = matrix[k][k];
+        if pivot == 0.0 || !pivot.is_finite() {
+            return None;
+        }
+        let scale = 1.0 / pivot;
+        matrix[k].iter_mut().chain(&mut inverse[k]).for_each(|entry| *entry *= scale);
+        let (own, of_inverse) = (matrix[k], inverse[k]);
+        for i in (0..N).filter(|i| *i != k) {
+            let factor = matrix[i][k];
+            for j in 0..N {
+                matrix[i][j] -= factor * own[j];
+                inverse[i][j] -= factor * of_inverse[j];
+            }
+        }
+    }
+    Some(inverse)
+}
+
+impl<const N: usize> Factors<N> {
+    fn new(plan: &HeldLimb) -> Self {
+        let rows = [Block::ZERO; N];
+        let above = Above { start: rows, end: rows, upper: rows, lower: rows };
+        Self {
+            inverses: [[[0.0; N]; N]; 2],
+            own: [[0.0; N]; N],
+            above: vec![above; plan.above.len().div_ceil(LANES)],
+        }
+    }
+
+    /// Finds `A_l⁻¹` at one of the ends; returns one over its largest entry, in units of the steepest equations.
+    #[inline(always)]
+    fn invert(&mut self, model: &Model, plan: &HeldLimb, closure: &Closure, end: usize) -> f64 {
+        let n = model.dimensions.coordinates();
+        let mut own = [[0.0; N]; N];
+        for (k, row) in own.iter_mut().enumerate() {
+            row[k] = 1.0;
+        }
+        for (row, c) in own.iter_mut().zip(plan.equations.clone()) {
+            let entries = &closure.jacobian[c * n..][..n];
+            row[..plan.equations.len()].copy_from_slice(&entries[plan.coordinates.clone()]);
+        }
+        let Some(inverse) = inverse(own) else { return 0.0 };
+        let mut largest = 1.0_f64;
+        for (row, i) in inverse.iter().zip(plan.coordinates.clone()) {
+            let (inertia, weights) =
+                (model.conditioning.inertia[i], &model.conditioning.weight[plan.equations.clone()]);
+            for (entry, weight) in row.iter().zip(weights) {
+                let size = entry * entry * inertia / (weight * weight);
+                largest = if size <= largest { largest } else { size };
+            }
+        }
+        self.inverses[end] = inverse;
+        1.0 / largest.sqrt()
+    }
+
+    /// Takes its part of `K` and of the Jacobians.
+    #[inline(always)]
+    fn take<E: Eight>(
+        &mut self,
+        model: &Model,
+        plan: &HeldLimb,
+        matrix: &TreeLu,
+        [start, end]: [&Closure; 2],
+    ) {
+        let (n, count) = (model.dimensions.coordinates(), plan.above.len());
+        let offsets = &model.elimination.offsets;
+        for (a, i) in plan.coordinates.clone().enumerate() {
+            for b in 0..=a {
+                self.own[a][b] = matrix.lower[offsets[i] + count + b];
+                self.own[b][a] = matrix.upper[offsets[i] + count + b];
+            }
+        }
+        for (above, (place, rows)) in
+            plan.above.chunks(LANES).zip((0..).step_by(LANES).zip(&mut self.above))
+        {
+            let [mut by_start, mut by_end] = [[Block::ZERO; N]; 2];
+            for (k, c) in plan.equations.clone().enumerate() {
+                let entries = [start, end].map(|closure| &closure.jacobian[c * n..][..n]);
+                for (lane, &i) in above.iter().enumerate() {
+                    by_start[k].0[lane] = entries[0][i];
+                    by_end[k].0[lane] = entries[1][i];
+                }
+            }
+            for (k, i) in plan.coordinates.clone().enumerate() {
+                let slots = offsets[i] + place..offsets[i] + place + above.len();
+                rows.upper[k].0[..above.len()].copy_from_slice(&matrix.upper[slots.clone()]);
+                rows.lower[k].0[..above.len()].copy_from_slice(&matrix.lower[slots]);
+            }
+            let (by_start, by_end) = (loaded::<E, N>(&by_start), loaded::<E, N>(&by_end));
+            let mut goes = [E::ZERO; N];
+            for k in 0..N {
+                sum_of(&by_start, &self.inverses[0][k]).put(&mut rows.start[k]);
+                goes[k] = sum_of(&by_end, &self.inverses[1][k]);
+                goes[k].put(&mut rows.end[k]);
+            }
+            for k in 0..N {
+                let rest = E::of(&rows.lower[k]).minus(sum_of(&goes, &self.own[k]));
+                rest.put(&mut rows.lower[k]);
+            }
+        }
+    }
+
+    /// Adds `−K_bl G1 − G0ᵀ E`.
+    #[inline(always)]
+    fn change<E: Eight>(&self, plan: &HeldLimb, sums: &mut [Block]) {
+        let width = self.above.len();
+        for (column, rows) in self.above.iter().enumerate() {
+            let (end, lower) = (loaded::<E, N>(&rows.end), loaded::<E, N>(&rows.lower));
+            for d in 0..plan.above.len() {
+                let (from, lane) = (&self.above[d / LANES], d % LANES);
+                let sum = &mut sums[d * width + column];
+                let [mut by_end, mut by_lower] = [E::of(sum), E::ZERO];
+                for k in 0..N {
+                    by_end = by_end.minus(end[k].scaled(from.upper[k].0[lane]));
+                    by_lower = by_lower.plus(lower[k].scaled(from.start[k].0[lane]));
+                }
+                by_end.minus(by_lower).put(sum);
+            }
+        }
+    }
+
+    /// `c` and `s` in place of right-hand sides, and what they give to the coordinates above.
+    #[inline(always)]
+    fn lift<E: Eight>(&self, own: &mut [f64], lambda: &mut [f64], flow: &mut [Block]) {
+        let [mut c, mut s, mut right] = [[0.0; N]; 3];
+        right.iter_mut().zip(&*lambda).for_each(|(to, from)| *to = *from);
+        s.iter_mut().zip(&*own).for_each(|(to, from)| *to = *from);
+        for k in 0..N {
+            c[k] = dot(&self.inverses[1][k], &right);
+        }
+        for k in 0..N {
+            s[k] -= dot(&self.own[k], &c);
+        }
+        for (rows, flow) in self.above.iter().zip(flow) {
+            let upper = sum_of(&loaded::<E, N>(&rows.upper), &c);
+            let start = sum_of(&loaded::<E, N>(&rows.start), &s);
+            E::of(flow).plus(upper.plus(start)).put(flow);
+        }
+        lambda.iter_mut().zip(c).for_each(|(to, from)| *to = from);
+        own.iter_mut().zip(s).for_each(|(to, from)| *to = from);
+    }
+
+    /// The solution, from `c`, `s` and that of the coordinates above.
+    #[inline(always)]
+    fn lower<E: Eight>(&self, own: &mut [f64], lambda: &mut [f64], above: &[Block]) {
+        let [mut y, mut pushed] = [[0.0; N]; 2];
+        y.iter_mut().zip(&*lambda).for_each(|(to, from)| *to = *from);
+        pushed.iter_mut().zip(&*own).for_each(|(to, from)| *to = *from);
+        for (rows, above) in self.above.iter().zip(above) {
+            let above = E::of(above);
+            for k in 0..N {
+                y[k] -= E::of(&rows.end[k]).dot(above);
+                pushed[k] -= E::of(&rows.lower[k]).dot(above);
+            }
+        }
+        own.iter_mut().zip(y).for_each(|(to, from)| *to = from);
+        for (c, lambda) in lambda.iter_mut().enumerate() {
+            *lambda = (0..N).map(|k| self.inverses[0][k][c] * pushed[k]).sum();
+        }
+    }
+
+    /// [`Self::lift`] for eight right-hand sides; `above` are the rows of all coordinates above the limb's.
+    #[inline(always)]
+    fn lift_rows<E: Eight>(
+        &self,
+        plan: &HeldLimb,
+        above: &mut [f64],
+        [own, lambda]: [&mut [f64]; 2],
+        stride: usize,
+    ) {
+        let size = plan.equations.len();
+        let [mut c, mut s, mut right] = [[E::ZERO; N]; 3];
+        for k in 0..size {
+            right[k] = E::of_list(&lambda[k * stride..][..LANES]);
+            s[k] = E::of_list(&own[k * stride..][..LANES]);
+        }
+        for k in 0..N {
+            c[k] = sum_of(&right, &self.inverses[1][k]);
+        }
+        for k in 0..N {
+            s[k] = s[k].minus(sum_of(&c, &self.own[k]));
+        }
+        for (&i, d) in plan.above.iter().zip(0..) {
+            let (rows, lane) = (&self.above[d / LANES], d % LANES);
+            let target = &mut above[i * stride..][..LANES];
+            let [mut upper, mut start] = [E::of_list(target), E::ZERO];
+            for k in 0..N {
+                upper = upper.minus(c[k].scaled(rows.upper[k].0[lane]));
+                start = start.plus(s[k].scaled(rows.start[k].0[lane]));
+            }
+            upper.minus(start).put_list(target);
+        }
+        for k in 0..size {
+            c[k].put_list(&mut lambda[k * stride..][..LANES]);
+            s[k].put_list(&mut own[k * stride..][..LANES]);
+        }
+    }
+
+    /// [`Self::lower`] for eight right-hand sides.
+    #[inline(always)]
+    fn lower_rows<E: Eight>(
+        &self,
+        plan: &HeldLimb,
+        above: &[f64],
+        [own, lambda]: [&mut [f64]; 2],
+        stride: usize,
+    ) {
+        let size = plan.equations.len();
+        let [mut y, mut pushed] = [[E::ZERO; N]; 2];
+        for k in 0..size {
+            y[k] = E::of_list(&lambda[k * stride..][..LANES]);
+            pushed[k] = E::of_list(&own[k * stride..][..LANES]);
+        }
+        for (&i, d) in plan.above.iter().zip(0..) {
+            let (rows, lane) = (&self.above[d / LANES], d % LANES);
+            let at = E::of_list(&above[i * stride..][..LANES]);
+            for k in 0..N {
+                y[k] = y[k].minus(at.scaled(rows.end[k].0[lane]));
+                pushed[k] = pushed[k].minus(at.scaled(rows.lower[k].0[lane]));
+            }
+        }
+        for k in 0..size {
+            y[k].put_list(&mut own[k * stride..][..LANES]);
+            let mut sum = E::ZERO;
+            for (pushed, inverse) in pushed.iter().zip(&self.inverses[0]) {
+                sum = sum.plus(pushed.scaled(inverse[k]));
+            }
+            sum.put_list(&mut lambda[k * stride..][..LANES]);
+        }
+    }
+}
+
+/// What [`HeldLimbs::factor`] does with limbs; returns the smallest pivot of the equations.
+struct Eliminate<'a> {
+    limbs: &'a mut HeldLimbs,
+    model: &'a Model,
+    held: &'a Held,
+    matrix: &'a TreeLu,
+    closures: [&'a Closure; 2],
+}
+
+impl InEights for Eliminate<'_> {
+    type Output = f64;
+
+    #[inline(always)]
+    fn run<E: Eight>(self) -> f64 {
+        let Self { limbs, model, held, matrix, closures } = self;
+        limbs.sums.fill(Block::ZERO);
+        let mut equations = 1.0_f64;
+        for at in 0..held.limbs.len() {
+            let (plan, sums) = (&held.limbs[at], &mut limbs.sums);
+            of_limb!(&mut limbs.limbs[at], limb => {
+                for (end, closure) in closures.into_iter().enumerate() {
+                    equations = equations.min(limb.invert(model, plan, closure, end));
+                }
+                if equations < SOUND {
+                    return equations;
+                }
+                limb.take::<E>(model, plan, matrix, closures);
+                limb.change::<E>(plan, sums);
+            });
+            if plan.is_last {
+                limbs.put_sums(plan, held);
+            }
+        }
+        equations
+    }
+}
+
+/// The first half of a solution.
+struct Lift<'a> {
+    limbs: &'a mut HeldLimbs,
+    held: &'a Held,
+    x: &'a mut [f64],
+    lambda: &'a mut [f64],
+}
+
+impl InEights for Lift<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<E: Eight>(self) {
+        let Self { limbs: HeldLimbs { limbs, sums, .. }, held, x, lambda } = self;
+        for (plan, limb) in held.limbs.iter().zip(&*limbs) {
+            let flow = &mut sums[..plan.above.len().div_ceil(LANES)];
+            let (own, lambda) =
+                (&mut x[plan.coordinates.clone()], &mut lambda[plan.equations.clone()]);
+            if plan.is_first {
+                flow.fill(Block::ZERO);
+            }
+            of_limb!(limb, limb => limb.lift::<E>(own, lambda, flow));
+            if plan.is_last {
+                for (above, flow) in plan.above.chunks(LANES).zip(&*flow) {
+                    above.iter().zip(flow.0).for_each(|(&i, flow)| x[i] -= flow);
+                }
+            }
+        }
+    }
+}
+
+/// The second half.
+struct Lower<'a> {
+    limbs: &'a mut HeldLimbs,
+    held: &'a Held,
+    x: &'a mut [f64],
+    lambda: &'a mut [f64],
+}
+
+impl InEights for Lower<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<E: Eight>(self) {
+        let Self { limbs: HeldLimbs { limbs, sums, .. }, held, x, lambda } = self;
+        for (plan, limb) in held.limbs.iter().zip(&*limbs) {
+            let flow = &mut sums[..plan.above.len().div_ceil(LANES)];
+            if plan.is_first {
+                for (above, flow) in plan.above.chunks(LANES).zip(&mut *flow) {
+                    *flow = Block::ZERO;
+                    flow.0.iter_mut().zip(above).for_each(|(flow, &i)| *flow = x[i]);
+                }
+            }
+            let (own, lambda) =
+                (&mut x[plan.coordinates.clone()], &mut lambda[plan.equations.clone()]);
+            of_limb!(limb, limb => limb.lower::<E>(own, lambda, flow));
+        }
+    }
+}
+
+/// The first half of solutions side by side.
+struct LiftRows<'a> {
+    limbs: &'a HeldLimbs,
+    held: &'a Held,
+    x: &'a mut [f64],
+    lambda: &'a mut [f64],
+    stride: usize,
+    columns: usize,
+}
+
+impl InEights for LiftRows<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<E: Eight>(self) {
+        let Self { limbs, held, x, lambda, stride, columns } = self;
+        for (plan, limb) in held.limbs.iter().zip(&limbs.limbs) {
+            let (above, own) = x.split_at_mut(plan.coordinates.start * stride);
+            let lambda = &mut lambda[plan.equations.start * stride..];
+            for column in (0..columns).step_by(LANES) {
+                let (above, own) = (&mut above[column..], &mut own[column..]);
+                let rows = [own, &mut lambda[column..]];
+                of_limb!(limb, limb => limb.lift_rows::<E>(plan, above, rows, stride));
+            }
+        }
+    }
+}
+
+/// The second half.
+struct LowerRows<'a> {
+    limbs: &'a HeldLimbs,
+    held: &'a Held,
+    x: &'a mut [f64],
+    lambda: &'a mut [f64],
+    stride: usize,
+    columns: usize,
+}
+
+impl InEights for LowerRows<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<E: Eight>(self) {
+        let Self { limbs, held, x, lambda, stride, columns } = self;
+        for (plan, limb) in held.limbs.iter().zip(&limbs.limbs) {
+            let (above, own) = x.split_at_mut(plan.coordinates.start * stride);
+            let lambda = &mut lambda[plan.equations.start * stride..];
+            for column in (0..columns).step_by(LANES) {
+                let (above, own) = (&above[column..], &mut own[column..]);
+                let rows = [own, &mut lambda[column..]];
+                of_limb!(limb, limb => limb.lower_rows::<E>(plan, above, rows, stride));
+            }
+        }
+    }
+}
