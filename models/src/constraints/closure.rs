@@ -9,7 +9,7 @@ use plantd_math::spatial::{Mat3, Vec3, three};
 
 use crate::constraints::in_plane::InPlane;
 use crate::lagrangian::kinematics::{Place, Poses};
-use crate::model::mechanism::{AlongAxis, ConstraintKind, Length, Model, PointDistance, PointPair};
+use crate::model::mechanism::{ConstraintKind, Length, Model, PointDistance, PointPair};
 use crate::model::tree::{JointKind, Tree};
 
 /// A configuration may violate a constraint by this fraction of the lengths involved.
@@ -194,13 +194,12 @@ impl<S: Scalar> Closure<S> {
         let n = model.dimensions.coordinates();
         out.fill(S::ZERO);
         self.pulls.fill(Pull::NONE);
-        let mut are_pulled = false;
-        for (constraint, &lambda) in model.constraints.iter().zip(multipliers) {
+        let (mut are_pulled, mut c) = (false, 0);
+        while let Some(constraint) = model.constraints.get(c) {
+            let lambda = multipliers[c];
             match &constraint.kind {
-                ConstraintKind::Axis(AlongAxis { points, axis, .. }) => {
-                    let mut force = Vec3::ZERO;
-                    force.0[*axis] = lambda;
-                    self.pull(model, points, force);
+                ConstraintKind::Axis(equation) => {
+                    self.pull(model, &equation.points, equation.force(&multipliers[c..]));
                     are_pulled = true;
                 }
                 ConstraintKind::Distance(PointDistance { points, length })
@@ -221,6 +220,7 @@ impl<S: Scalar> Closure<S> {
                     });
                 }
             }
+            c += constraint.count();
         }
         if are_pulled {
             self.add_pulls(&model.closure, n, out);

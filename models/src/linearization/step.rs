@@ -260,13 +260,17 @@ impl Workspace {
                     }
                 }
                 add_rows_portable(target, &out.increment, stride, &self.tangents.terms);
-            }
-            for (c, constraint) in model.constraints.iter().enumerate() {
-                for &i in constraint.dynamic_coordinates() {
-                    let entry = self.constraints.start.jacobian[c * n + i];
-                    let target = &mut out.momentum[i * stride..][..stride];
-                    add_rows_portable(target, &out.multipliers, stride, &[(-entry, c)]);
+                if d.constraints == 0 {
+                    continue;
                 }
+                let column = self.constraints.start.jacobian[i..].iter().step_by(n);
+                self.tangents.terms.clear();
+                for (c, entry) in column.enumerate() {
+                    if *entry != 0.0 {
+                        self.tangents.terms.push((-entry, c));
+                    }
+                }
+                add_rows_portable(target, &out.multipliers, stride, &self.tangents.terms);
             }
         })
     }

@@ -12,6 +12,15 @@ use crate::lagrangian::kinematics::Place;
 use crate::model::mechanism::AlongAxis;
 
 impl AlongAxis {
+    /// The force of the multipliers of its own equation and of those that follow.
+    pub(crate) fn force<S: Scalar>(&self, multipliers: &[S]) -> Vec3<S> {
+        let mut force = Vec3::ZERO;
+        for (axis, multiplier) in self.axes().zip(multipliers) {
+            force.0[axis] = *multiplier;
+        }
+        force
+    }
+
     /// Its own axis, and those of the equations that follow.
     #[inline(always)]
     fn axes(&self) -> impl Iterator<Item = usize> {
@@ -42,8 +51,10 @@ impl Equation for AlongAxis {
         let at = self.points.separation(tree, poses);
         for joint in &self.points.path {
             let gradient = joint.gradient(tree, poses, &at);
-            for (axis, row) in self.axes().zip(rows.chunks_exact_mut(q.len())) {
-                row[joint.coordinate] = gradient[axis];
+            let mut at = joint.coordinate;
+            for axis in self.axes() {
+                rows[at] = gradient[axis];
+                at += q.len();
             }
         }
     }
