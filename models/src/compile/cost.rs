@@ -79,7 +79,9 @@ impl Model {
         }
         if nc > 0.0 {
             let values = in_space(&self.closure) / 2.0 + 200.0 * nc;
-            stages.push(stage("constraints", 3.2, values));
+            // Where the last correction leads they are looked at in any case.
+            let looks = if is_foreseen { evaluations + 1.0 } else { evaluations };
+            stages.push(stage("constraints", looks, values));
             linearization += jacobian + hessians;
             if plan.is_some() {
                 stages.push(stage("their wrenches", 2.1, 310.0 * joints));

@@ -180,10 +180,9 @@ impl<S: Scalar> Closure<S> {
     #[inline(never)]
     pub(crate) fn subtract_impulses(&self, model: &Model, multipliers: &[S], out: &mut [S]) {
         let n = model.dimensions.coordinates();
-        for (c, constraint) in model.constraints.iter().enumerate() {
-            let (row, lambda) = (&self.jacobian[c * n..][..n], multipliers[c]);
-            for &i in constraint.dynamic_coordinates() {
-                out[i] -= row[i] * lambda;
+        for (row, lambda) in self.jacobian.chunks_exact(n.max(1)).zip(multipliers) {
+            for (out, entry) in out.iter_mut().zip(row) {
+                *out -= *entry * *lambda;
             }
         }
     }

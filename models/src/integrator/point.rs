@@ -3,11 +3,14 @@
 use crate::model::mechanism::{Dimensions, Model};
 
 /// The point where a step was factored: its length, forces of inputs, increments, angles, velocities of
-/// prescribed coordinates, orientations. In a state its `w` comes last.
+/// prescribed coordinates, orientations; with constraints coordinates and orientations at the start and at the end.
+/// In a state its `w` comes last.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Point {
-    /// Empty where no input pushes, or more than bodies is pushed.
+    /// Empty where no input pushes, or what is pushed is more than bodies and limbs whose ends are held.
     pub(crate) numbers: Vec<f64>,
+    /// Whether it has the start and the end.
+    pub(crate) has_ends: bool,
 }
 
 /// The parts of a point.
@@ -17,26 +20,30 @@ pub(crate) struct Parts<'a> {
     pub(crate) angles: &'a [f64],
     pub(crate) prescribed: &'a [f64],
     pub(crate) orientations: &'a [f64],
+    /// Coordinates and orientations at the start and at the end.
+    pub(crate) ends: [[&'a [f64]; 2]; 2],
     pub(crate) weighed: &'a [f64],
 }
 
 impl Point {
     /// Numbers of a point in a state, with so many dynamic and prescribed coordinates and orientations.
-    pub(crate) fn length(nd: usize, nk: usize, orientations: usize) -> usize {
-        1 + 4 * nd + 2 * nk + 9 * orientations
+    pub(crate) fn length([nd, nk, orientations]: [usize; 3], has_ends: bool) -> usize {
+        let ends = if has_ends { 2 * (nd + nk + 9 * orientations) } else { 0 };
+        1 + 4 * nd + 2 * nk + 9 * orientations + ends
     }
 
-    pub(crate) fn zeros(length: usize) -> Self {
-        Self { numbers: vec![0.0; length] }
+    pub(crate) fn zeros(length: usize, has_ends: bool) -> Self {
+        Self { numbers: vec![0.0; length], has_ends }
     }
 
     /// Of the plants of a model.
     pub(crate) fn of(model: &Model) -> Self {
         let Dimensions { dynamic, prescribed, .. } = model.dimensions;
-        let is_free = model.planar.is_none() && model.constraints.is_empty();
-        let pushes = is_free && model.is_of_bodies() && !model.coordinate_inputs.is_empty();
-        let length = Self::length(dynamic, prescribed, model.orientations.len());
-        if pushes { Self::zeros(length) } else { Self::default() }
+        let has_ends = model.held.is_some();
+        let is_known = model.planar.is_none() && (model.constraints.is_empty() || has_ends);
+        let pushes = is_known && model.is_of_bodies() && !model.coordinate_inputs.is_empty();
+        let length = Self::length([dynamic, prescribed, model.orientations.len()], has_ends);
+        if pushes { Self::zeros(length, has_ends) } else { Self::default() }
     }
 
     pub(crate) fn is_empty(&self) -> bool {
@@ -70,8 +77,18 @@ impl Point {
         let (increment, rest) = rest.split_at(nd);
         let (angles, rest) = rest.split_at(n);
         let (prescribed, rest) = rest.split_at(n - nd);
-        let (orientations, weighed) = rest.split_at(rest.len() - nd);
-        Parts { force, increment, angles, prescribed, orientations, weighed }
+        let (mut orientations, weighed) = rest.split_at(rest.len() - nd);
+        let mut ends = [[&[][..]; 2]; 2];
+        if self.has_ends {
+            let count = (orientations.len() - 2 * n) / 3;
+            let (own, mut rest) = orientations.split_at(count);
+            orientations = own;
+            for [q, turned] in &mut ends {
+                (*q, rest) = rest.split_at(n);
+                (*turned, rest) = rest.split_at(count);
+            }
+        }
+        Parts { force, increment, angles, prescribed, orientations, ends, weighed }
     }
 
     /// Becomes another point of the same size; allocates nothing.

@@ -255,7 +255,14 @@ impl Past {
     /// Its kind and its counts, for snapshots.
     pub(crate) fn code(&self) -> [u8; 3] {
         match self.kind {
-            Kind::Increments => [if self.point.is_empty() { 0 } else { 3 }, self.known, self.order],
+            Kind::Increments => {
+                let of_point = match &self.point {
+                    point if point.is_empty() => 0,
+                    point if point.has_ends => 4,
+                    _ => 3,
+                };
+                [of_point, self.known, self.order]
+            }
             Kind::Trail => [1, self.known, 0],
             Kind::Stages(stages) => [2, self.known + 2 * u8::from(self.is_even), stages],
         }
@@ -267,7 +274,7 @@ impl Past {
     pub(crate) fn from_code(code: [u8; 3], [nd, nk, no]: [usize; 3]) -> Option<(Self, [usize; 2])> {
         let longest = LENGTH as u8;
         let (kind, known, order, is_even) = match code {
-            [0 | 3, known, order] if known <= longest && order <= known => {
+            [0 | 3 | 4, known, order] if known <= longest && order <= known => {
                 (Kind::Increments, known, order, true)
             }
             [1, known, 0] if known <= longest => (Kind::Trail, known, 0, true),
@@ -276,9 +283,12 @@ impl Past {
             }
             _ => return None,
         };
-        let (numbers, point) = (Vec::new(), Point::default());
-        let past = Self { kind, numbers, known, order, is_even, point };
-        let of_point = if code[0] == 3 { Point::length(nd, nk, no) } else { 0 };
+        let point = Point { has_ends: code[0] == 4, ..Point::default() };
+        let of_point = match code[0] {
+            3 | 4 => Point::length([nd, nk, no], point.has_ends),
+            _ => 0,
+        };
+        let past = Self { kind, numbers: Vec::new(), known, order, is_even, point };
         let lengths = [past.length(nd), of_point];
         Some((past, lengths))
     }
@@ -295,7 +305,7 @@ impl Past {
     /// Makes room for its numbers.
     pub(crate) fn make_room(&mut self, [own, point]: [usize; 2]) {
         self.numbers.resize(own, 0.0);
-        self.point = Point::zeros(point);
+        self.point = Point::zeros(point, self.point.has_ends);
     }
 
     /// Whether the other is of the same method and size.

@@ -11,9 +11,12 @@ use plantd_math::rotation::Turn;
 use plantd_math::scalar::Scalar;
 use plantd_math::spatial::{Mat3, Vec3, three};
 
+use crate::constraints::closure::Known;
 use crate::integrator::point::Parts;
 use crate::integrator::response::Place;
 use crate::integrator::workspace::{StepContext, Workspace};
+use crate::kkt::system::Factors;
+use crate::model::mechanism::Model;
 
 /// `a f[k] + (1 − a) f[k−1]`.
 #[inline(always)]
@@ -48,9 +51,15 @@ impl Workspace {
             self.response.pushed.fill(0.0);
             return;
         }
-        let Self { kkt, constraints, response, step, .. } = self;
+        let Self { kkt, constraints, response, residual, step, .. } = self;
+        if last.has_ends && response.kept.valid != Factors::Recursion {
+            // All equations were taken together.
+            response.pushed.fill(0.0);
+            return;
+        }
         std::mem::swap(&mut kkt.factored, &mut response.kept);
-        kkt.solve(model, &constraints.end, &mut response.pushed, &mut []);
+        residual.constraints.fill(0.0);
+        kkt.solve(model, &constraints.end, &mut response.pushed, &mut residual.constraints);
         std::mem::swap(&mut kkt.factored, &mut response.kept);
         if !response.pushed.iter().all(|x| x.is_finite()) {
             response.pushed.fill(0.0);
@@ -66,7 +75,7 @@ impl Workspace {
     fn factor_again(&mut self, at: StepContext<'_>) -> bool {
         let StepContext { model, settings, state, .. } = at;
         let (nd, n) = (model.dimensions.dynamic, model.dimensions.coordinates());
-        let Parts { force, increment, angles, prescribed, orientations, .. } =
+        let Parts { force, increment, angles, prescribed, orientations, ends, .. } =
             state.past.point.parts(nd, n);
         let (mid, inverse) = (&mut self.mid, 1.0 / settings.time_step_s);
         mid.q.copy_from_slice(angles);
@@ -84,7 +93,16 @@ impl Workspace {
             }
         }
         mid.evaluate(model);
+        if state.past.point.has_ends {
+            self.go_to_ends(model, ends);
+            self.nudge.position.copy_from_slice(&self.step.increment);
+            self.step.increment.copy_from_slice(increment);
+        }
         let is_factored = self.factor(model, settings, state).is_ok();
+        if state.past.point.has_ends {
+            self.step.increment.copy_from_slice(&self.nudge.position);
+            self.constraints.start.known = Known::Nothing;
+        }
         if is_factored {
             std::mem::swap(&mut self.kkt.factored, &mut self.response.kept);
             self.response.kept_at.copy_from(&state.past.point);
@@ -94,12 +112,27 @@ impl Workspace {
         is_factored
     }
 
+    /// Goes back to the constraints at the ends of the last step.
+    fn go_to_ends(&mut self, model: &Model, [start, end]: [[&[f64]; 2]; 2]) {
+        let Self { constraints, balls, step, .. } = self;
+        for (closure, matrices, [q, turned]) in [
+            (&mut constraints.start, &mut balls.start, start),
+            (&mut constraints.end, &mut balls.end, end),
+        ] {
+            for (matrix, numbers) in matrices.iter_mut().zip(turned.as_chunks::<9>().0) {
+                *matrix = Mat3([0, 3, 6].map(|i| three(numbers, i)));
+            }
+            closure.complete(model, q, matrices);
+        }
+        step.q_end.copy_from_slice(end[0]);
+    }
+
     /// Takes note of the point where the step has just been factored for the first time.
     #[inline(never)]
     pub(crate) fn note_point(&mut self, at: StepContext<'_>) {
         let StepContext { model, settings, state, .. } = at;
         let (h, a) = (settings.time_step_s, settings.force_split.at_start());
-        let Self { response, mid, step, .. } = self;
+        let Self { response, mid, step, balls, .. } = self;
         response.place = Place::System;
         let (nd, n) = (model.dimensions.dynamic, model.dimensions.coordinates());
         let end = response.point.numbers.len() - nd;
@@ -119,8 +152,17 @@ impl Workspace {
         put(&step.increment);
         put(&mid.angles);
         put(&mid.velocity[nd..]);
-        for Mat3([x, y, z]) in &mid.orientations {
-            [x, y, z].into_iter().for_each(|Vec3(column)| put(column));
+        let put_all = |orientations: &[Mat3], put: &mut dyn FnMut(&[f64])| {
+            for Mat3([x, y, z]) in orientations {
+                [x, y, z].into_iter().for_each(|Vec3(column)| put(column));
+            }
+        };
+        put_all(&mid.orientations, &mut put);
+        if last.has_ends {
+            for (q, turned) in [(&state.q, &balls.start), (&step.q_end, &balls.end)] {
+                put(q);
+                put_all(turned, &mut put);
+            }
         }
     }
 }

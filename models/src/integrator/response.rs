@@ -13,9 +13,9 @@ pub(crate) struct Response {
     pub(crate) point: Point,
     /// Where those factors are.
     pub(super) place: Place,
-    first: Factored,
+    pub(crate) first: Factored,
     /// Of another point.
-    pub(super) kept: Factored,
+    pub(crate) kept: Factored,
     pub(super) kept_at: Point,
 }
 

@@ -78,9 +78,13 @@ pub(crate) struct ConstraintPair {
 impl ConstraintPair {
     /// The end of this step is the start of the next.
     pub(crate) fn move_on(&mut self) {
-        self.end.turn_back();
-        std::mem::swap(&mut self.start, &mut self.end);
-        self.end.known = Known::Nothing;
+        if self.end.known > Known::Nothing {
+            self.end.turn_back();
+            std::mem::swap(&mut self.start, &mut self.end);
+            self.end.known = Known::Nothing;
+        } else {
+            self.forget();
+        }
     }
 
     /// The state has changed: nothing of the last step holds.

@@ -16,12 +16,14 @@ use crate::linearization::second_order::tensors::SecondOrder;
 use crate::model::mechanism::{Model, Solver};
 use crate::plant::facade::Plant;
 use crate::plant::initial::Initial;
+use crate::plant::snapshot::Snapshot;
 
 /// A scene in its making: all angles are zero where it begins.
 #[derive(Default)]
 struct Sketch {
     frames: String,
     constraints: String,
+    inputs: String,
     count: usize,
 }
 
@@ -41,6 +43,10 @@ impl Sketch {
                  joint = {{ {joint} }}\nbody = {{ {body} }}"
             )
             .unwrap();
+            if joint.contains("revolute") {
+                writeln!(self.inputs, "[[inputs]]\nname = \"u{name}\"\ncoordinate = \"{name}\"")
+                    .unwrap();
+            }
             at.iter_mut().zip(offset).for_each(|(at, offset)| *at += offset);
             (parent, self.count) = (name, self.count + 1);
         }
@@ -71,8 +77,8 @@ impl Sketch {
 
     fn compile(&self, more: &str) -> Model {
         let text = format!(
-            "format = 1\nname = \"held\"\ntime_step_s = 0.002\ngravity = [0.3, 0.0, -9.81]\n{more}\n{}{}",
-            self.frames, self.constraints
+            "format = 1\nname = \"held\"\ntime_step_s = 0.002\ngravity = [0.3, 0.0, -9.81]\n{more}\n{}{}{}",
+            self.frames, self.constraints, self.inputs
         );
         Model::compile(&Scene::from_toml(&text).unwrap()).unwrap()
     }
@@ -139,7 +145,10 @@ fn both(model: Model) -> [Plant; 2] {
         fast.step(&vec![0.0; model.dimensions().input()]).unwrap();
     }
     let mut slow = fast.clone();
-    slow.workspace.kkt.factored.recursion = Recursion::None;
+    let Workspace { kkt, response, .. } = &mut slow.workspace;
+    for factored in [&mut kkt.factored, &mut response.first, &mut response.kept] {
+        factored.recursion = Recursion::None;
+    }
     [fast, slow]
 }
 
@@ -265,6 +274,40 @@ fn straight_legs_are_left_to_the_tree() {
     slow.step(&u).unwrap();
     assert_eq!(refused.workspace.kkt.factored.valid, Factors::Tree);
     assert_eq!(refused.snapshot(), slow.snapshot());
+}
+
+/// Torques that change at each step are guessed, by the factors of the last step or by those that are made again.
+#[test]
+fn guesses_follow_from_the_state_alone() {
+    for model in [humanoid(), carriage(0.1)] {
+        let [mut plant, _] = both(model);
+        let count = plant.model().dimensions().input();
+        let input = |k: u32| -> Vec<f64> {
+            (0..count as u32).map(|i| 0.3 * f64::from(k * k + 7 * i).sin()).collect()
+        };
+        let mut out = Linearization::new(plant.model());
+        let mut evaluations = 0;
+        for k in 0..40 {
+            let u = input(k);
+            let bytes = plant.snapshot().to_bytes();
+            let mut restored = Plant::new(Arc::clone(plant.model()), *plant.settings()).unwrap();
+            restored.restore(&Snapshot::from_bytes(&bytes).unwrap()).unwrap();
+            let mut linearized = plant.clone();
+            linearized.linearize(&input(k + 3), &mut out).unwrap();
+            let report = plant.step(&u).unwrap();
+            evaluations += if k < 10 { 0 } else { report.iterations };
+            restored.step(&u).unwrap();
+            linearized.step_and_linearize(&u, &mut out).unwrap();
+            assert_eq!(plant.snapshot(), restored.snapshot(), "{k}");
+            assert_eq!(plant.snapshot(), linearized.snapshot(), "{k}");
+            if k % 3 == 0 {
+                plant = restored;
+            } else if k % 3 == 1 {
+                plant = linearized;
+            }
+        }
+        assert!(evaluations < 75, "{evaluations}");
+    }
 }
 
 #[test]
