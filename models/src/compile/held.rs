@@ -55,7 +55,7 @@ impl Model {
         };
         let are_last = limbs.iter().all(|limb| limb.above.iter().all(|above| !is_held(above)));
         let others = (0..d.dynamic).filter(|k| !is_held(k));
-        if !are_last || others.clone().any(|k| proper(k).iter().any(|above| is_held(above))) {
+        if !are_last || others.clone().any(|k| proper(k).iter().any(is_held)) {
             return None;
         }
         let rest = (0..d.dynamic).map(|k| if is_held(&k) { BTreeSet::new() } else { proper(k) });

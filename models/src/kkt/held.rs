@@ -63,9 +63,9 @@ struct Above<const N: usize> {
 #[derive(Clone, Debug)]
 enum Limb {
     /// A point.
-    Three(Factors<3>),
+    Three(Box<Factors<3>>),
     /// Anything else.
-    Six(Factors<MOST>),
+    Six(Box<Factors<MOST>>),
 }
 
 /// The same for each kind of limb.
@@ -100,8 +100,8 @@ impl HeldLimbs {
     pub(crate) fn new(held: &Held) -> Self {
         let most = held.limbs.iter().map(|limb| limb.above.len()).max().unwrap_or_default();
         let limb = |limb: &HeldLimb| match limb.equations.len() {
-            3 => Limb::Three(Factors::new(limb)),
-            _ => Limb::Six(Factors::new(limb)),
+            3 => Limb::Three(Box::new(Factors::new(limb))),
+            _ => Limb::Six(Box::new(Factors::new(limb))),
         };
         Self {
             limbs: held.limbs.iter().map(limb).collect(),
@@ -180,6 +180,35 @@ impl HeldLimbs {
                 }
             }
             row.fill(Block::ZERO);
+        }
+    }
+}
+
+/// The numbers of a list, and zeros; without a call to copy them.
+#[inline(always)]
+fn taken<const N: usize>(list: &[f64]) -> [f64; N] {
+    if let Some(numbers) = list.first_chunk() {
+        return *numbers;
+    }
+    let mut numbers = [0.0; N];
+    for (k, number) in numbers.iter_mut().enumerate() {
+        if let Some(from) = list.get(k) {
+            *number = *from;
+        }
+    }
+    numbers
+}
+
+/// The way back, as long as the list is.
+#[inline(always)]
+fn put<const N: usize>(numbers: [f64; N], list: &mut [f64]) {
+    if let Some(to) = list.first_chunk_mut() {
+        *to = numbers;
+        return;
+    }
+    for (k, number) in numbers.into_iter().enumerate() {
+        if let Some(to) = list.get_mut(k) {
+            *to = number;
         }
     }
 }
@@ -277,7 +306,10 @@ impl<const N: usize> Factors<N> {
         }
         for (row, c) in own.iter_mut().zip(plan.equations.clone()) {
             let entries = &closure.jacobian[c * n..][..n];
-            row[..plan.equations.len()].copy_from_slice(&entries[plan.coordinates.clone()]);
+            let entries: [f64; N] = taken(&entries[plan.coordinates.clone()]);
+            for (k, entry) in row.iter_mut().enumerate().take(plan.equations.len()) {
+                *entry = entries[k];
+            }
         }
         let Some(inverse) = inverse(own) else { return 0.0 };
         let mut largest = 1.0_f64;
@@ -323,15 +355,15 @@ impl<const N: usize> Factors<N> {
             }
             for (k, i) in plan.coordinates.clone().enumerate() {
                 let slots = offsets[i] + place..offsets[i] + place + above.len();
-                rows.upper[k].0[..above.len()].copy_from_slice(&matrix.upper[slots.clone()]);
-                rows.lower[k].0[..above.len()].copy_from_slice(&matrix.lower[slots]);
+                rows.upper[k].0 = taken(&matrix.upper[slots.clone()]);
+                rows.lower[k].0 = taken(&matrix.lower[slots]);
             }
             let (by_start, by_end) = (loaded::<E, N>(&by_start), loaded::<E, N>(&by_end));
             let mut goes = [E::ZERO; N];
-            for k in 0..N {
+            for (k, goes) in goes.iter_mut().enumerate() {
                 sum_of(&by_start, &self.inverses[0][k]).put(&mut rows.start[k]);
-                goes[k] = sum_of(&by_end, &self.inverses[1][k]);
-                goes[k].put(&mut rows.end[k]);
+                *goes = sum_of(&by_end, &self.inverses[1][k]);
+                goes.put(&mut rows.end[k]);
             }
             for k in 0..N {
                 let rest = E::of(&rows.lower[k]).minus(sum_of(&goes, &self.own[k]));
@@ -362,30 +394,26 @@ impl<const N: usize> Factors<N> {
     /// `c` and `s` in place of right-hand sides, and what they give to the coordinates above.
     #[inline(always)]
     fn lift<E: Eight>(&self, own: &mut [f64], lambda: &mut [f64], flow: &mut [Block]) {
-        let [mut c, mut s, mut right] = [[0.0; N]; 3];
-        right.iter_mut().zip(&*lambda).for_each(|(to, from)| *to = *from);
-        s.iter_mut().zip(&*own).for_each(|(to, from)| *to = *from);
-        for k in 0..N {
-            c[k] = dot(&self.inverses[1][k], &right);
+        let (right, mut s, mut c) = (taken(lambda), taken(own), [0.0; N]);
+        for (c, inverse) in c.iter_mut().zip(&self.inverses[1]) {
+            *c = dot(inverse, &right);
         }
-        for k in 0..N {
-            s[k] -= dot(&self.own[k], &c);
+        for (s, own) in s.iter_mut().zip(&self.own) {
+            *s -= dot(own, &c);
         }
         for (rows, flow) in self.above.iter().zip(flow) {
             let upper = sum_of(&loaded::<E, N>(&rows.upper), &c);
             let start = sum_of(&loaded::<E, N>(&rows.start), &s);
             E::of(flow).plus(upper.plus(start)).put(flow);
         }
-        lambda.iter_mut().zip(c).for_each(|(to, from)| *to = from);
-        own.iter_mut().zip(s).for_each(|(to, from)| *to = from);
+        put(c, lambda);
+        put(s, own);
     }
 
     /// The solution, from `c`, `s` and that of the coordinates above.
     #[inline(always)]
     fn lower<E: Eight>(&self, own: &mut [f64], lambda: &mut [f64], above: &[Block]) {
-        let [mut y, mut pushed] = [[0.0; N]; 2];
-        y.iter_mut().zip(&*lambda).for_each(|(to, from)| *to = *from);
-        pushed.iter_mut().zip(&*own).for_each(|(to, from)| *to = *from);
+        let (mut y, mut pushed) = (taken::<N>(lambda), taken::<N>(own));
         for (rows, above) in self.above.iter().zip(above) {
             let above = E::of(above);
             for k in 0..N {
@@ -393,10 +421,14 @@ impl<const N: usize> Factors<N> {
                 pushed[k] -= E::of(&rows.lower[k]).dot(above);
             }
         }
-        own.iter_mut().zip(y).for_each(|(to, from)| *to = from);
-        for (c, lambda) in lambda.iter_mut().enumerate() {
-            *lambda = (0..N).map(|k| self.inverses[0][k][c] * pushed[k]).sum();
+        put(y, own);
+        let mut multipliers = [0.0; N];
+        for (pushed, inverse) in pushed.iter().zip(&self.inverses[0]) {
+            for (sum, entry) in multipliers.iter_mut().zip(inverse) {
+                *sum += pushed * entry;
+            }
         }
+        put(multipliers, lambda);
     }
 
     /// [`Self::lift`] for eight right-hand sides; `above` are the rows of all coordinates above the limb's.
@@ -414,11 +446,11 @@ impl<const N: usize> Factors<N> {
             right[k] = E::of_list(&lambda[k * stride..][..LANES]);
             s[k] = E::of_list(&own[k * stride..][..LANES]);
         }
-        for k in 0..N {
-            c[k] = sum_of(&right, &self.inverses[1][k]);
+        for (c, inverse) in c.iter_mut().zip(&self.inverses[1]) {
+            *c = sum_of(&right, inverse);
         }
-        for k in 0..N {
-            s[k] = s[k].minus(sum_of(&c, &self.own[k]));
+        for (s, own) in s.iter_mut().zip(&self.own) {
+            *s = s.minus(sum_of(&c, own));
         }
         for (&i, d) in plan.above.iter().zip(0..) {
             let (rows, lane) = (&self.above[d / LANES], d % LANES);
