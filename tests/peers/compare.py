@@ -388,6 +388,7 @@ def measure_growth(plantd):
 
 ERRORS = [1e-2, 1e-4, 1e-6, 1e-8, 1e-10]
 CASES = [("P", 2), ("P", 10), ("D", 2), ("D", 10), ("S", 2), ("S", 10), ("C4", 2)]
+ROBOT_CASES = [("panda", 1), ("go1", 1), ("g1", 1), ("B7", 1), ("go1-feet", 1)]
 HIGH_ORDERS = [("plantd", f"order-{order}{to}") for order in (4, 6, 8, 12) for to in ("", "-fast")]
 FIXED_STEP = [PLANTD, *HIGH_ORDERS]
 FIXED_STEP += [m for m in STEP_METHODS if m[0] not in ("plantd", "CasADi C")]
@@ -409,9 +410,10 @@ def repeated(driver, *command):
     return seconds, q
 
 
-def curve(driver, name, method, end, reference):
+def curve(drivers, name, method, end, reference):
     """(error, CPU seconds) over time steps or tolerances, coarse to fine."""
-    points = []
+    driver_name, method = method
+    driver, points = drivers[driver_name], []
     if method in ("dop853", "rk3", "rk5"):
         commands = [(f"{method}:{10 ** -(k / 2):.3e}", 0.1, round(end / 0.1)) for k in range(2, 28)]
     else:
@@ -422,7 +424,7 @@ def curve(driver, name, method, end, reference):
             seconds, q = repeated(driver, name, what, dt, steps)
         except RuntimeError:
             continue  # Too coarse.
-        error = error_of(q, reference)
+        error = error_of(coordinates(name, driver_name, q), reference)
         points.append((error, seconds))
         if seconds > LONGEST_SECONDS or error < 1e-13:
             break
@@ -434,14 +436,21 @@ def time_to_reach(points, error):
     return min((seconds for e, seconds in points if e <= error), default=None)
 
 
-def measure_accuracy(drivers):
+def measure_accuracy(drivers, only):
     references = json.loads((HERE / "references.json").read_text())["q"]
     curves = {}
-    for name, end in CASES:
-        reference = references[name][str(end)]
+    for name, end in CASES + ROBOT_CASES:
+        if only and name not in only:
+            continue
+        if name in references:
+            reference = references[name][str(end)]
+        else:
+            # Of robots the peer's finest, which is none of plantd's.
+            q = drivers["Pinocchio"].ask(name, "dop853:1e-14", 0.1, round(end / 0.1))[1]
+            reference = coordinates(name, "Pinocchio", q)
         for method in FIXED_STEP + ADAPTIVE:
-            if method[0] in drivers:
-                points = curve(drivers[method[0]], name, method[1], end, reference)
+            if method[0] in drivers and applies(name, method):
+                points = curve(drivers, name, method, end, reference)
                 curves.setdefault((name, end), {})[method] = points
         say(f"{name}, T = {end} s: done")
     return curves
@@ -583,7 +592,7 @@ def main():
     steps = measure_calls(drivers, names, STEP_METHODS, options.rounds)
     derivatives = measure_calls(drivers, names, AB_METHODS, options.rounds)
     growth = [] if options.accuracy_alone or not names else list(measure_growth(drivers["plantd"]))
-    curves = {} if options.without_accuracy else measure_accuracy(drivers)
+    curves = {} if options.without_accuracy else measure_accuracy(drivers, options.only)
     report = ["# plantd beside its peers", "", *conditions(), "", "## One step", ""]
     report += [*table_of_calls(steps, STEP_METHODS), "", "## One step, A and B", ""]
     report += [*table_of_calls(derivatives, AB_METHODS), "", "## Goals", ""]

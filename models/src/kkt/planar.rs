@@ -349,7 +349,15 @@ impl PlanarRecursion {
         momentum: &mut [f64],
         stride: usize,
     ) {
-        in_eights(Linearize { recursion: self, tree, joints, diagonal, increment, momentum, stride });
+        in_eights(Linearize {
+            recursion: self,
+            tree,
+            joints,
+            diagonal,
+            increment,
+            momentum,
+            stride,
+        });
     }
 }
 

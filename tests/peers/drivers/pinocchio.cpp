@@ -37,6 +37,11 @@ struct Mechanism {
   // Joints that turn as no coordinates do, and the first velocity that has a motor.
   std::vector<pinocchio::JointIndex> groups;
   int first_motor = 0;
+  // Of all joints: the first numbers of configuration and velocity, and how many velocities.
+  struct Place {
+    int q, v, size;
+  };
+  std::vector<Place> places;
   std::vector<pinocchio::RigidConstraintModel> constraints;
   std::vector<pinocchio::RigidConstraintData> constraint_data;
   pinocchio::ProximalSettings settings;
@@ -83,6 +88,9 @@ struct Mechanism {
       sizes.push_back(size);
       model.appendBodyToJoint(joint, pinocchio::Inertia(mass, com, about_com), pinocchio::SE3::Identity());
     }
+    for (int j = 1; j < model.njoints; ++j) {
+      places.push_back({model.joints[j].idx_q(), model.joints[j].idx_v(), model.joints[j].nv()});
+    }
     q0.resize(model.nq);
     v0.resize(model.nv);
     rough.resize(model.nv);
@@ -124,12 +132,14 @@ struct Mechanism {
   }
 };
 
+using Place = Mechanism::Place;
+
 class Run {
 public:
   explicit Run(Mechanism &mechanism)
-      : m_(mechanism), n_(m_.model.nv), q(m_.q0), v(m_.v0), A(2 * n_, 2 * n_),
-        B(2 * n_, n_ - m_.first_motor), dq_(n_, n_), dv_(n_, n_), minverse_(n_, n_), y_(2 * n_),
-        stage_(2 * n_), scale_(2 * n_), k_(2 * n_, 13), by_q_(MatrixXd::Zero(n_, n_)),
+      : m_(mechanism), n_(m_.model.nv), nq_(m_.model.nq), q(m_.q0), v(m_.v0), A(2 * n_, 2 * n_),
+        B(2 * n_, n_ - m_.first_motor), dq_(n_, n_), dv_(n_, n_), minverse_(n_, n_), y_(nq_ + n_),
+        stage_(nq_ + n_), scale_(nq_ + n_), k_(nq_ + n_, 13), by_q_(MatrixXd::Zero(n_, n_)),
         by_v_(MatrixXd::Zero(n_, n_)), step_(n_) {
     by_lambda_.fill(MatrixXd::Zero(3 * m_.constraints.size(), n_));
   }
@@ -146,32 +156,7 @@ public:
     move(h);
   }
 
-  // Stages of ball and free joints are velocities of the turn since the start of the step. To compare
-  // configurations with: its dense solutions are not made to be timed.
-  void rk4_on_groups(double h) {
-    const VectorXd q_start = q, v_start = v;
-    static const double node[3] = {0.5, 0.5, 1.0};
-    VectorXd turn = VectorXd::Zero(n_), velocity = v;
-    MatrixXd back = MatrixXd::Identity(n_, n_);
-    for (int s = 0; s < 4; ++s) {
-      step_ = turn;
-      q = pinocchio::integrate(m_.model, q_start, step_);
-      // How the turn changes: velocity = J turn'.
-      pinocchio::dIntegrate(m_.model, q_start, step_, back, pinocchio::ARG1);
-      k_.col(s).head(n_) = back.partialPivLu().solve(velocity);
-      k_.col(s).tail(n_) = acceleration(q, velocity);
-      if (s < 3) {
-        turn = h * node[s] * k_.col(s).head(n_);
-        velocity = v_start + h * node[s] * k_.col(s).tail(n_);
-      }
-    }
-    y_ = (h / 6) * (k_.col(0) + 2 * k_.col(1) + 2 * k_.col(2) + k_.col(3));
-    q = pinocchio::integrate(m_.model, q_start, y_.head(n_));
-    v = v_start + y_.tail(n_);
-  }
-
   void rk4(double h) {
-    if (!m_.groups.empty()) return rk4_on_groups(h);
     y_ << q, v;
     static const double node[3] = {0.5, 0.5, 1.0};
     stage_ = y_;
@@ -180,7 +165,7 @@ public:
       if (s < 3) stage_.noalias() = y_ + (h * node[s]) * k_.col(s);
     }
     y_.noalias() += (h / 6) * (k_.col(0) + 2 * k_.col(1) + 2 * k_.col(2) + k_.col(3));
-    q = y_.head(n_);
+    q = y_.head(nq_);
     v = y_.tail(n_);
   }
 
@@ -228,7 +213,7 @@ public:
       const double third =
           ((k_ * Eigen::Map<const VectorXd>(DOP853_E3, 13)).cwiseQuotient(scale_)).squaredNorm();
       const double sum = fifth + 0.01 * third;
-      const double error = sum == 0 ? 0 : h * fifth / std::sqrt(sum * double(2 * n_));
+      const double error = sum == 0 ? 0 : h * fifth / std::sqrt(sum * double(nq_ + n_));
       if (!std::isfinite(error)) throw std::runtime_error("the motion is lost");
       double factor = error == 0 ? 10 : 0.9 * std::pow(error, -1.0 / 8);
       if (error < 1) {
@@ -242,7 +227,7 @@ public:
         rejected = true;
       }
     }
-    q = y_.head(n_);
+    q = y_.head(nq_);
     v = y_.tail(n_);
   }
 
@@ -290,15 +275,39 @@ private:
         m_.model, *m_.data, at, velocity, m_.tau, m_.constraints, m_.constraint_data, m_.settings);
   }
 
+  // Quaternions are integrated as four numbers, as they are, and taken with length 1.
   void rate(const VectorXd &y, int column) {
-    at_ = y.head(n_);
+    at_ = y.head(nq_);
     velocity_ = y.tail(n_);
-    k_.col(column).head(n_) = velocity_;
+    double *rates = &k_(0, column);
+    if (m_.groups.empty()) {
+      k_.col(column).head(n_) = velocity_;
+    } else {
+      for (const Place &place : m_.places) {
+        double *own = rates + place.q;
+        const double *speed = velocity_.data() + place.v;
+        if (place.size == 1) {
+          *own = *speed;
+          continue;
+        }
+        double *numbers = at_.data() + place.q + place.size - 3;
+        if (place.size == 6) {
+          const Eigen::Quaterniond turn = Eigen::Map<Eigen::Quaterniond>(numbers).normalized();
+          Eigen::Map<Eigen::Vector3d>{own} = turn * Eigen::Vector3d(speed[0], speed[1], speed[2]);
+          own += 3;
+          speed += 3;
+        }
+        Eigen::Map<Eigen::Quaterniond> turn(numbers);
+        const Eigen::Quaterniond spin(0, 0.5 * speed[0], 0.5 * speed[1], 0.5 * speed[2]);
+        Eigen::Map<Eigen::Vector4d>{own} = (turn * spin).coeffs();
+        turn.normalize();
+      }
+    }
     k_.col(column).tail(n_) = acceleration(at_, velocity_);
   }
 
   Mechanism &m_;
-  int n_;
+  int n_, nq_;
 
 public:
   VectorXd q, v;

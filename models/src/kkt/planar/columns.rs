@@ -201,10 +201,9 @@ impl Columns {
         let own = &joints[first..joints.len().min(first + LANES)];
         let end = own.iter().zip(first..).map(|(joint, i)| i + 1 + joint.descendants).max();
         let mut above = [E::ZERO; 3];
-        for i in first..end.unwrap_or_default() {
-            let (joint, link) = (&joints[i], tree.link(i));
-            let parent_is_there = joint.parent > first;
-            let twist = if parent_is_there {
+        for (i, joint) in joints.iter().enumerate().take(end.unwrap_or_default()).skip(first) {
+            let link = tree.link(i);
+            let twist = if joint.parent > first {
                 from_above(i, joint, above, &self.motions)
             } else {
                 [E::ZERO; 3]
@@ -351,11 +350,8 @@ impl Columns {
             let Slope { plus, push, rate, .. } = self.slopes[i];
             let (x, momentum) = (E::of(&self.increment[i]), &mut self.momentum[i]);
             let [n, fx, fy] = from_below(joint, below, &mut self.flows[i]);
-            let up = [
-                n.plus(x.scaled(push[0])),
-                fx.plus(x.scaled(push[1])),
-                fy.plus(x.scaled(push[2])),
-            ];
+            let up =
+                [n.plus(x.scaled(push[0])), fx.plus(x.scaled(push[1])), fy.plus(x.scaled(push[2]))];
             let moved = product([plus[0], rate[0], rate[1]], up);
             E::of(momentum).plus(moved).put(momentum);
             pass_up(i, joint, up, &mut below, &mut self.flows);
