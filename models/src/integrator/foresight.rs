@@ -257,4 +257,40 @@ mod tests {
         }
         assert!(unseen > 250, "{unseen}");
     }
+
+    /// The same with constraints, which hold where nobody looked at the rest.
+    #[test]
+    fn constraints_hold_and_what_is_unseen_is_round_off() {
+        let mut unseen = 0;
+        for name in ["four-bar", "scissor-8", "marionette"] {
+            let model = Arc::new(Model::compile(&builtin::scene(name).unwrap()).unwrap());
+            let settings = Settings { time_step_s: 0.002, ..Settings::new(&model) };
+            let mut plant = Plant::new(Arc::clone(&model), settings).unwrap();
+            plant.initialize(&Initial::Scene).unwrap();
+            let mut u = vec![0.0; model.dimensions.input()];
+            plant.hold_input(&mut u);
+            for _ in 0..60 {
+                let report = plant.solve(&u, None).unwrap();
+                let Plant { model, state, workspace, .. } = &mut plant;
+                if !workspace.step.is_evaluated {
+                    unseen += 1;
+                    assert!(report.constraint_residual <= HELD, "{name}");
+                    let impulse = workspace.step.impulse.clone();
+                    let size = workspace.evaluate(model, &settings, state);
+                    assert!(size < 64.0, "{name}: {size}");
+                    workspace.find_impulse(model, &settings);
+                    let Workspace { step, constraints, residual, .. } = &mut *workspace;
+                    let multipliers = &step.multipliers;
+                    constraints.start.subtract_pushes(model, multipliers, &mut step.impulse);
+                    let apart: Vec<f64> =
+                        impulse.iter().zip(&step.impulse).map(|(a, b)| a - b).collect();
+                    let apart = largest(&apart) / (f64::EPSILON * residual.round_off);
+                    assert!(apart < 16.0, "{name}: {apart}");
+                    step.impulse.copy_from_slice(&impulse);
+                }
+                plant.commit();
+            }
+        }
+        assert!(unseen > 60, "{unseen}");
+    }
 }
