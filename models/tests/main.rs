@@ -4,6 +4,7 @@
 //! the time.
 
 mod accuracy;
+mod closures;
 mod collocation;
 mod common;
 mod continuous;

@@ -217,7 +217,9 @@ fn settings_out_of_range_are_refused() {
         let error = refused(&pendulum, &|s| s.order = order);
         assert!(matches!(error, InitialError::Order { .. }), "{error}");
     }
-    let error = refused(&builtin("four-bar"), &|s| s.order = 12);
+    let weld = format!("{}/../scenes/elements/weld.toml", env!("CARGO_MANIFEST_DIR"));
+    let weld = Scene::from_toml(&std::fs::read_to_string(weld).unwrap()).unwrap();
+    let error = refused(&weld, &|s| s.order = 12);
     assert!(matches!(error, InitialError::Order { order: 12, .. }), "{error}");
     let paper = plantd_models::ForceSplit::Paper;
     let error = refused(&pendulum, &|s| (s.order, s.force_split) = (4, paper));

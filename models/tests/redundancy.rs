@@ -106,6 +106,39 @@ fn multipliers_have_least_norm() {
     }
 }
 
+/// Collocation takes redundant equations as the midpoint rule does.
+#[test]
+fn collocation_has_redundant_equations() {
+    for (redundant, count) in [(doubled(), 2), (out_of_plane(false), 1), (out_of_plane(true), 1)] {
+        for order in [4, 8, 12] {
+            let mut one = plant(&plain(&redundant), |s| s.order = order);
+            let mut two = plant(&redundant, |s| s.order = order);
+            for k in 0..60 {
+                let u = waving_input(&one, k);
+                assert_eq!(one.step(&u).unwrap().redundant_constraints, 0);
+                let report = two.step(&u).unwrap();
+                assert_eq!((report.redundant_constraints, report.halvings), (count, 0));
+                assert!(report.constraint_reciprocal_condition > 1e-5, "{report:?}");
+            }
+            for (x, y) in one.q().iter().zip(two.q()).chain(one.p().iter().zip(two.p())) {
+                assert!((x - y).abs() < 1e-10, "order {order}: {x} instead of {y}");
+            }
+            let u = waving_input(&one, 61);
+            let (first, second) = (linearization(&mut one, &u), linearization(&mut two, &u));
+            let scale = first.a().amax();
+            assert!((first.a() - second.a()).amax() < 1e-9 * scale, "A");
+            assert!((first.b() - second.b()).amax() < 1e-9 * scale, "B");
+            if count == 2 {
+                let (whole, halves) = (one.multipliers(), two.multipliers());
+                for c in 0..2 {
+                    assert!((halves[c] - 0.5 * whole[c]).abs() < 1e-11, "{whole:?} {halves:?}");
+                    assert!((halves[c] - halves[c + 2]).abs() < 1e-13, "{halves:?}");
+                }
+            }
+        }
+    }
+}
+
 /// Equations that are stated twice share what one of them carries, in derivatives too.
 #[test]
 fn doubled_equations_share_evenly() {

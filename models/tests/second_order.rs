@@ -201,6 +201,11 @@ impl Check {
     }
 }
 
+/// The second-order linearization with any settings.
+pub(crate) fn check_with(scene: &Scene, settings: impl FnOnce(&mut Settings)) {
+    Check::with(scene, settings).all();
+}
+
 fn check(scene: &Scene) {
     for split in SPLITS {
         Check::new(scene, split).all();

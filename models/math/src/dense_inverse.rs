@@ -38,6 +38,11 @@ impl DenseInverse {
         }
     }
 
+    /// Makes room for right-hand sides of so many columns.
+    pub fn reserve(&mut self, columns: usize) {
+        self.right.reserve(self.order * columns);
+    }
+
     /// Inverts what stands in `matrix`, in its place, about `2n³` flops; false if it is singular.
     #[inline(never)]
     pub fn invert(&mut self) -> bool {

@@ -8,19 +8,22 @@
 //! ```
 //!
 //! `μ_ij + μ_ji = 1` makes the method symplectic whatever the rounding of the weights. Where ball joints turn it
-//! says the same of curves on the rotations: see [`balls`].
+//! says the same of curves on the rotations: see [`balls`]. Constraints hold at nodes of their own: see [`closures`].
 //!
 //! Few unknowns are corrected by Newton's method with the dense Jacobian of the guess. Many, and those of ball
 //! joints, are corrected with the mass matrices of the stages, O(n·depth), by corrections that learn from those
-//! before ([`masses`], [`secants`]), until all residuals are at round-off; where that is slow, because something is
-//! stiff, the dense Jacobian is taken after all.
+//! before ([`masses`], [`secants`]), until all residuals are at round-off; with constraints, by the linear system of
+//! the midpoint rule ([`middle`]). Where that is slow, because something is stiff, the dense Jacobian is taken after
+//! all.
 //!
 //! Prescribed coordinates move at a constant rate, `c_i` of the way at node `i`. Inputs that signals drive
 //! are taken at the nodes.
 
 pub(crate) mod balls;
+pub(crate) mod closures;
 pub(crate) mod hessian;
 pub(crate) mod masses;
+pub(crate) mod middle;
 pub(crate) mod secants;
 pub(crate) mod slopes;
 pub(crate) mod system;
@@ -33,6 +36,8 @@ use crate::model::mechanism::Model;
 
 /// Unknowns up to which the dense Jacobian is taken.
 const DENSE: usize = 48;
+/// The same with constraints, whose multipliers count: where the two cost the same (scissor lifts, the marionette).
+const DENSE_BOUND: usize = 54;
 
 /// A step, and all memory that it needs.
 #[derive(Clone, Debug)]
@@ -51,7 +56,9 @@ impl Collocation {
     pub(crate) fn new(model: &Model, stages: usize) -> Self {
         let d = model.dimensions;
         let tableau = Tableau::new(stages);
-        let by_masses = stages * d.dynamic > DENSE || !model.orientations.is_empty();
+        let most = if d.constraints > 0 { DENSE_BOUND } else { DENSE };
+        let unknowns = stages * (d.dynamic + d.constraints);
+        let by_masses = unknowns > most || !model.orientations.is_empty();
         let mut system = System::new(model, &tableau, by_masses);
         if !by_masses {
             system.make_dense(model, &tableau);
@@ -75,18 +82,22 @@ impl Collocation {
         self.guess(workspace, at, start_s)?;
         let Self { tableau, inputs, motion, system } = self;
         system.begin(at, motion, inputs, &mut workspace.mid.input_force);
-        let mut report = match system.correct_by_masses(workspace, at, inputs) {
+        let mut report = match system.correct_alike(workspace, at, inputs) {
             Some(report) => report,
             None => {
                 system.make_dense(at.model, tableau);
                 system.begin(at, motion, inputs, &mut workspace.mid.input_force);
-                system.correct(workspace, at, inputs)?
+                let corrected = system.correct(workspace, at, inputs);
+                corrected.map_err(|error| explain(workspace, at, error))?
             }
         };
-        let sums = [&mut *workspace.step.increment, &mut *workspace.step.impulse];
-        system.finish(at.model, motion, sums)?;
+        let step = &mut workspace.step;
+        let sums = [&mut *step.increment, &mut *step.impulse, &mut *step.multipliers];
+        system.finish(at.model, motion, report.redundant_constraints, sums)?;
         workspace.prepare(at);
-        workspace.kkt.estimates.write(&mut report);
+        if at.model.dimensions.constraints == 0 {
+            workspace.kkt.estimates.write(&mut report);
+        }
         Ok(report)
     }
 
@@ -123,4 +134,13 @@ impl Collocation {
         }
         Ok(())
     }
+}
+
+/// Why a step could not be solved, where constraints are the reason.
+#[cold]
+fn explain(workspace: &mut Workspace, at: StepContext<'_>, error: StepError) -> StepError {
+    if at.model.dimensions.constraints > 0 {
+        workspace.prepare(at);
+    }
+    at.model.explain(error, at.state, &workspace.step.q_end)
 }

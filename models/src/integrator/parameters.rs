@@ -54,6 +54,18 @@ impl Parameters {
         self.next() + self.nk
     }
 
+    /// By which parameters a coordinate is moved at a fraction of the step, if it is not moved by unknowns, and how
+    /// far.
+    pub(crate) fn moves(
+        &self,
+        coordinate: usize,
+        fraction: f64,
+    ) -> impl Iterator<Item = (usize, f64)> {
+        let start = if coordinate < self.nd { 1.0 } else { 1.0 - fraction };
+        let next = coordinate.checked_sub(self.nd).map(|k| (self.next() + k, fraction));
+        std::iter::once((coordinate, start)).chain(next)
+    }
+
     /// Which of the six numbers that turn the ends of a prescribed ball joint a parameter is.
     pub(crate) fn end_of(&self, coordinate: usize, parameter: usize) -> Option<usize> {
         let ends = [coordinate, self.next() + coordinate.wrapping_sub(self.nd)];

@@ -9,9 +9,15 @@
 //! ```
 //!
 //! of which the sum is skew to the last bit: `μ_ij + μ_ji = 1`, which is what makes the method symplectic.
+//! Constraints hold at the nodes of Lobatto (see [`closures`](super::collocation::closures)), up to which the
+//! velocities at the nodes of Gauss are integrated,
+//!
+//! ```text
+//! κ_ji = (∫ ℓ_i) / b_i = ½ (1 + x̃_j) + ½ Σ_k P_k(x_i) (P_{k+1}(x̃_j) − P_{k−1}(x̃_j)),  k = 1 … s − 1
+//! ```
 //!
 //! **Symmetric compositions** take the midpoint rule with the steps `γ_1 h … γ_m h`, forward and
-//! backward, which keeps constraints: the five steps of Suzuki (Phys. Lett. A 146, 1990),
+//! backward, where constraints meet ball joints: the five steps of Suzuki (Phys. Lett. A 146, 1990),
 //! and the nine and seventeen of Kahan and Li (Math. Comp. 66, 1997).
 
 use plantd_math::trigonometry::sin_cos_of;
@@ -69,14 +75,16 @@ const KAHAN_LI_8: [f64; 17] = {
 impl Scheme {
     /// The method that has the order for a model.
     pub(crate) fn of_order(order: u32, model: &Model) -> Result<Self, &'static str> {
-        let is_bound = model.dimensions().constraints > 0;
-        match (order, is_bound) {
+        let is_composed = model.dimensions().constraints > 0 && !model.orientations.is_empty();
+        match (order, is_composed) {
             (2, _) => Ok(Self::Midpoint),
             (4 | 6 | 8 | 12, false) => Ok(Self::Gauss(order as usize / 2)),
             (4, true) => Ok(Self::Composition(&SUZUKI_4)),
             (6, true) => Ok(Self::Composition(&KAHAN_LI_6)),
             (8, true) => Ok(Self::Composition(&KAHAN_LI_8)),
-            (12, true) => Err("is not there with constraints, which go to 8"),
+            (12, true) => {
+                Err("is not there with ball joints and constraints in one scene, which go to 8")
+            }
             _ => Err("is none of 2, 4, 6, 8 and 12"),
         }
     }
@@ -110,6 +118,13 @@ pub(crate) struct Tableau {
     /// The velocities of the next step from those of the last: the collocation polynomial one step on,
     /// column after column.
     pub(crate) onward: Vec<f64>,
+    /// The nodes of Lobatto, `s + 1` with both ends, where constraints hold.
+    pub(crate) ends: Vec<f64>,
+    /// `κ_ji = (∫ ℓ_i) / b_i` from the start to the node `j` of Lobatto, row-major.
+    pub(crate) reach: Vec<f64>,
+    /// What a node has of the constraint impulses of a step where forces are constant: that of the start has what
+    /// the end of the step before has, too.
+    pub(crate) shares: Vec<f64>,
 }
 
 /// `P_0(x) … P_s(x)`.
@@ -121,6 +136,33 @@ fn legendre(x: f64) -> [f64; STAGES_MAX + 1] {
         p[k + 1] = ((2.0 * order + 1.0) * x * p[k] - order * p[k - 1]) / (order + 1.0);
     }
     p
+}
+
+/// The nodes of Lobatto from −1 to 1: the ends, and between them the roots of `P_s'`.
+fn lobatto(stages: usize) -> Vec<f64> {
+    let count = stages as f64;
+    let root = |i: usize| {
+        let mut x = -sin_cos_of(std::f64::consts::PI * i as f64 / count).1;
+        for _ in 0..10 {
+            let p = legendre(x);
+            let rest = 1.0 - x * x;
+            let slope = count * (p[stages - 1] - x * p[stages]) / rest;
+            x -= slope * rest / (2.0 * x * slope - count * (count + 1.0) * p[stages]);
+        }
+        x
+    };
+    let mut nodes: Vec<f64> = (0..=stages)
+        .map(|i| match i {
+            0 => -1.0,
+            i if i == stages => 1.0,
+            i => root(i),
+        })
+        .collect();
+    for i in 1..stages {
+        nodes[i] = 0.5 * (nodes[i] - nodes[stages - i]);
+        nodes[stages - i] = -nodes[i];
+    }
+    nodes
 }
 
 impl Tableau {
@@ -161,7 +203,20 @@ impl Tableau {
         }
         // No digit is lost: what rounds is `μ`.
         let skew = coupling.iter().map(|mu| mu - 0.5).collect();
-        Self { nodes, weights, coupling, skew, onward }
+        let ends = lobatto(stages);
+        let mut reach = Vec::with_capacity(ends.len() * stages);
+        for (x, y) in ends.iter().flat_map(|x| roots.iter().map(move |y| (x, y))) {
+            let (p, q) = (legendre(*x), legendre(*y));
+            let rest: f64 = (1..stages).map(|k| q[k] * (p[k + 1] - p[k - 1])).sum();
+            reach.push(0.5 * ((1.0 + x) + rest));
+        }
+        let share = |(j, x): (usize, &f64)| {
+            let weight = 1.0 / (count * (count + 1.0) * legendre(*x)[stages].powi(2));
+            if j == 0 { 2.0 * weight } else { weight }
+        };
+        let shares = ends[..stages].iter().enumerate().map(share).collect();
+        let ends = ends.iter().map(|x| 0.5 + 0.5 * x).collect();
+        Self { nodes, weights, coupling, skew, onward, ends, reach, shares }
     }
 }
 
@@ -190,6 +245,34 @@ mod tests {
                     let sum = skew[i * stages + j] + skew[j * stages + i];
                     assert_eq!(sum, 0.0, "symmetric to the last bit");
                 }
+            }
+        }
+    }
+
+    /// Lobatto's quadrature, polynomials of degree s, and the ends.
+    #[test]
+    fn the_nodes_of_constraints_are_those_of_lobatto() {
+        for stages in [1, 2, 3, 4, 6] {
+            let Tableau { nodes, weights, ends, reach, shares, .. } = Tableau::new(stages);
+            let mut lobatto = shares.clone();
+            lobatto[0] *= 0.5;
+            lobatto.push(lobatto[0]);
+            for k in 1..=2 * stages as i32 {
+                let sum: f64 = lobatto.iter().zip(&ends).map(|(b, c)| b * c.powi(k - 1)).sum();
+                assert!((sum - 1.0 / f64::from(k)).abs() < 2e-15, "B({k}), {stages} stages");
+            }
+            for (c, row) in ends.iter().zip(reach.chunks_exact(stages)) {
+                for k in 1..=stages as i32 {
+                    let entries = row.iter().zip(&weights).zip(&nodes);
+                    let sum: f64 = entries.map(|((m, b), c)| m * b * c.powi(k - 1)).sum();
+                    assert!((sum - c.powi(k) / f64::from(k)).abs() < 2e-15, "C({k})");
+                }
+            }
+            assert_eq!(reach[..stages], vec![0.0; stages], "where a step begins");
+            assert_eq!(reach[stages * stages..], vec![1.0; stages], "where it ends");
+            for (j, i) in (0..=stages).flat_map(|j| (0..stages).map(move |i| (j, i))) {
+                let back = reach[(stages - j) * stages + stages - 1 - i];
+                assert!((reach[j * stages + i] + back - 1.0).abs() < 1e-15, "there and back");
             }
         }
     }

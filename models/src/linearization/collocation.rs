@@ -6,12 +6,21 @@
 //! Y' = −(∂R/∂Y)⁻¹ R_θ        x' = Σ Y_i'        p[k+1]' = p' + Σ P_i,θ + (Σ ∂P_i/∂Y) Y'
 //! ```
 //!
+//! With constraints `h = 0` and their impulses `Λ` ([`closures`](crate::integrator::collocation::closures)),
+//! `J = ∂R/∂Y`, `B = ∂R/∂Λ`, `G = ∂h/∂Y` and `S = G J⁻¹ B`,
+//!
+//! ```text
+//! S Λ' = h_θ − G J⁻¹ R_θ        Y' = −J⁻¹ (R_θ + B Λ')        λ' = Σ Λ_j'
+//! p[k+1]' = p' + Σ P_i,θ − Σ Λ_j·D²h q' + (Σ ∂P_i/∂Y − Σ Λ_j·D²h κ_j) Y' − Σ Dhᵀ Λ_j'
+//! ```
+//!
 //! Costs O((s n)³) for `s` stages of `n` dynamic coordinates.
 
 use plantd_math::rows::{add_product, add_rows};
 use plantd_math::spatial::{Mat3, three};
 
 use crate::integrator::collocation::Collocation;
+use crate::integrator::collocation::closures::Closures;
 use crate::integrator::collocation::slopes::Slopes;
 use crate::integrator::collocation::system::System;
 use crate::integrator::parameters::Parameters;
@@ -20,7 +29,7 @@ use crate::integrator::scheme::Tableau;
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::{StepContext, Workspace};
 use crate::lagrangian::turning::Turning;
-use crate::linearization::linearize::{Linearization, StageTangents};
+use crate::linearization::linearize::{Linearization, NodeTangents, StageTangents};
 
 impl Collocation {
     /// Linearizes at the solution of the last step.
@@ -52,6 +61,10 @@ impl Collocation {
                 terms: Vec::new(),
                 momentum: vec![0.0; nd],
                 orientations: vec![Mat3::IDENTITY; model.orientations.len()],
+                nodes: system
+                    .closures
+                    .as_deref()
+                    .map(|closures| NodeTangents::new(closures, &theta)),
             })
         });
         system.evaluate(workspace, at, &self.inputs);
@@ -64,20 +77,41 @@ impl Collocation {
         }
         tangents.inputs.copy_from_slice(&self.inputs);
         workspace.prepare(at);
+        if let Some(closures) = &mut system.closures {
+            closures.curve(model, true);
+        }
         system.fill_matrix(at);
         if !system.matrix.invert() {
             return Err(StepError::NotFinite { iterations: 0 });
+        }
+        if let Some(closures) = &mut system.closures {
+            closures.factor(at, &mut system.matrix)?;
         }
         if system.slopes.is_some() {
             tangents.take(system, at.state);
         } else {
             tangents.fill(system, &self.tableau, &theta, h);
         }
-        let StageTangents { tangent, impulses, slopes, terms, .. } = &mut *tangents;
+        let StageTangents { tangent, impulses, slopes, terms, nodes, .. } = &mut *tangents;
+        let mut curvature = vec![0.0; if nodes.is_some() { nd * stride } else { 0 }];
+        if let Some(closures) = &system.closures {
+            closures.add_slopes(&theta, tangent, &mut curvature, slopes);
+        }
         system.matrix.solve_rows(tangent, stride);
-        tangent.iter_mut().for_each(|entry| *entry = -*entry);
-
         out.begin_collocation(h);
+        if let (Some(closures), Some(nodes)) = (&mut system.closures, nodes.as_mut()) {
+            closures.close(model, &theta, tangent, &mut nodes.tangent);
+            nodes.take(closures);
+            let mut lambda = vec![0.0; stride];
+            for c in 0..d.constraints {
+                lambda.fill(0.0);
+                terms.clear();
+                terms.extend((0..count).map(|j| (1.0, j * d.constraints + c)));
+                add_rows(&mut lambda, &nodes.tangent, stride, terms);
+                out.set_multiplier(c, &lambda);
+            }
+        }
+        tangent.iter_mut().for_each(|entry| *entry = -*entry);
         let turned = system.slopes.as_deref();
         for &c in &model.orientations {
             let turn = three(&workspace.step.increment, c);
@@ -98,6 +132,13 @@ impl Collocation {
             }
             let slopes = slopes[a * count * nd..][..count * nd].iter().copied();
             add_product(&mut moved, tangent, stride, slopes, terms);
+            if let Some(nodes) = nodes {
+                moved.iter_mut().zip(&curvature[a * stride..]).for_each(|(m, by)| *m += by);
+                let pulls = nodes.jacobians[..count * d.constraints * n].chunks_exact(n);
+                terms.clear();
+                terms.extend(pulls.map(|row| -row[a]).zip(0..));
+                add_rows(&mut moved, &nodes.tangent, stride, terms);
+            }
             out.set_rows(a, [&increment, &moved]);
         }
 
@@ -105,6 +146,31 @@ impl Collocation {
         tangents.matrix.take_inverse_of(&system.matrix);
         out.keep_stages(tangents);
         Ok(())
+    }
+}
+
+impl NodeTangents {
+    fn new(closures: &Closures, theta: &Parameters) -> Self {
+        let zeros = |len: usize| vec![0.0; len];
+        let jacobians = closures.at.iter().map(|at| at.jacobian.len()).sum();
+        Self {
+            q: zeros(closures.q.len()),
+            jacobians: zeros(jacobians),
+            multipliers: zeros(closures.multipliers.len()),
+            tangent: zeros(closures.multipliers.len() * theta.stride),
+            responses: zeros(closures.responses.len()),
+            schur: closures.schur.clone(),
+        }
+    }
+
+    /// Takes the nodes of the solution.
+    fn take(&mut self, closures: &Closures) {
+        self.q.copy_from_slice(&closures.q);
+        let nodes = self.jacobians.chunks_exact_mut(closures.at[0].jacobian.len().max(1));
+        nodes.zip(&closures.at).for_each(|(to, at)| to.copy_from_slice(&at.jacobian));
+        self.multipliers.copy_from_slice(&closures.multipliers);
+        self.responses.copy_from_slice(&closures.responses);
+        self.schur.take_factors_of(&closures.schur);
     }
 }
 

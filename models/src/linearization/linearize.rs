@@ -300,6 +300,14 @@ impl Linearization {
         }
     }
 
+    /// Sets `λ_c'` by the parameters `(q, p, u, k)`, for collocation.
+    pub(crate) fn set_multiplier(&mut self, c: usize, by: &[f64]) {
+        let theta = self.parameters();
+        let by_inputs = &by[theta.inputs()..theta.next()];
+        self.driven[(theta.nd + c) * theta.ni..][..theta.ni].copy_from_slice(by_inputs);
+        theta.drop_inputs(by, &mut self.multipliers[c * self.stride..][..self.stride]);
+    }
+
     pub(crate) fn solved_step(&self) -> &SolvedStep {
         &self.solved
     }
@@ -469,4 +477,19 @@ pub(crate) struct StageTangents {
     /// Momentum, and orientations of ball joints, at the start; with ball joints.
     pub(crate) momentum: Vec<f64>,
     pub(crate) orientations: Vec<Mat3>,
+    pub(crate) nodes: Option<NodeTangents>,
+}
+
+/// The same of the nodes where constraints hold.
+#[derive(Clone, Debug)]
+pub(crate) struct NodeTangents {
+    /// `Q̃_j`, `Dh` and `Λ_j`, node after node.
+    pub(crate) q: Vec<f64>,
+    pub(crate) jacobians: Vec<f64>,
+    pub(crate) multipliers: Vec<f64>,
+    /// `Λ_j'`, node after node, rows of the parameters.
+    pub(crate) tangent: Vec<f64>,
+    /// `J⁻¹ B`, row-major, padded, and the factors of `S`.
+    pub(crate) responses: Vec<f64>,
+    pub(crate) schur: PivotedLu,
 }

@@ -79,6 +79,11 @@ impl Plant {
             let ratio = f64::from(i32::from(state.halvings) - i32::from(halvings)).exp2();
             period.reached.past.stretch(ratio);
         }
+        if period.collocation.is_some() {
+            // What one step has of the impulses.
+            let share = 1.0 / count as f64;
+            period.reached.multipliers.iter_mut().for_each(|lambda| *lambda *= share);
+        }
         period.multipliers.fill(0.0);
         if let Some(out) = out.as_deref_mut() {
             period.chain.begin(model, out);
@@ -170,6 +175,8 @@ mod tests {
     use std::sync::Arc;
 
     use super::*;
+    use crate::integrator::predictor::Past;
+    use crate::integrator::scheme::Scheme;
     use crate::model::mechanism::Model;
     use plantd_scene::builtin;
 
@@ -182,5 +189,45 @@ mod tests {
         plant.state.halvings = 3;
         let report = plant.step(&[0.0]).unwrap();
         assert_eq!((report.halvings, report.steps), (1, 2));
+    }
+
+    /// With one stage, collocation is the midpoint rule, with its impulses.
+    #[test]
+    fn one_stage_is_the_midpoint_rule() {
+        for name in ["pendulum", "four-bar", "marionette"] {
+            let model = Arc::new(Model::compile(&builtin::scene(name).unwrap()).unwrap());
+            let mut midpoint = Plant::new(model.clone(), Settings::new(&model)).unwrap();
+            let mut gauss = midpoint.clone();
+            let scheme = Scheme::Gauss(1);
+            gauss.state.past = Past::new(scheme, &model);
+            gauss.period = Period::new(&model, scheme, &gauss.state);
+            let mut outs = [Linearization::new(&model), Linearization::new(&model)];
+            let near = |a: &[f64], b: &[f64], what: &str| {
+                let size = a.iter().fold(1.0_f64, |most, x| most.max(x.abs()));
+                let error = a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+                assert!(error < 1e-11 * size, "{name}: {what} by {error:e}");
+            };
+            for k in 0..40 {
+                let wave = |i: usize| 0.1 * (0.3 * f64::from(k) + i as f64).sin();
+                let d = model.dimensions;
+                let mut u: Vec<f64> = (0..d.inputs).map(wave).collect();
+                let held = model.coordinates[d.dynamic..].iter().enumerate();
+                u.extend(held.map(|(i, c)| c.initial + 0.1 * (wave(i) - 0.1 * (i as f64).sin())));
+                midpoint.step_and_linearize(&u, &mut outs[0]).unwrap();
+                gauss.step_and_linearize(&u, &mut outs[1]).unwrap();
+            }
+            near(midpoint.q(), gauss.q(), "q");
+            near(midpoint.p(), gauss.p(), "p");
+            near(midpoint.multipliers(), gauss.multipliers(), "λ");
+            let [a, b] = &outs;
+            for (a, b, what) in [
+                (a.a(), b.a(), "A"),
+                (a.b(), b.b(), "B"),
+                (a.multipliers_x(), b.multipliers_x(), "λ by x"),
+                (a.multipliers_u(), b.multipliers_u(), "λ by u"),
+            ] {
+                near(a.as_slice(), b.as_slice(), what);
+            }
+        }
     }
 }

@@ -11,8 +11,10 @@ use plantd_math::spatial::three;
 use plantd_math::trigonometry::without_turns;
 
 use crate::integrator::collocation::balls::Balls;
+use crate::integrator::collocation::closures::Closures;
 use crate::integrator::collocation::hessian::Hessian;
 use crate::integrator::collocation::masses::Masses;
+use crate::integrator::collocation::middle::Middle;
 use crate::integrator::collocation::slopes::Slopes;
 use crate::integrator::newton::{CHORD_FLOOR, FLOOR, STALE};
 use crate::integrator::report::{StepError, StepReport};
@@ -36,6 +38,23 @@ const SLUGGISH_ROUNDS: u32 = 6;
 const OF_LIGHT_BODIES: f64 = 1e-2;
 /// What a factorization costs, in rounds of corrections.
 const PATIENCE: i32 = 3;
+
+/// What corrects many stages, round after round, without their Jacobian.
+#[derive(Clone, Debug)]
+enum Alike {
+    Masses(Box<Masses>),
+    /// With constraints.
+    Middle(Box<Middle>),
+}
+
+impl Alike {
+    fn new(model: &Model, tableau: &Tableau, width: usize) -> Self {
+        if model.dimensions.constraints > 0 {
+            return Self::Middle(Box::new(Middle::new(model, tableau)));
+        }
+        Self::Masses(Box::new(Masses::new(model, width, tableau.nodes.len())))
+    }
+}
 
 /// The stages, and all memory that they need.
 #[derive(Clone, Debug)]
@@ -65,9 +84,10 @@ pub(crate) struct System {
     l_q: Vec<Lanes>,
     l_v: Vec<Lanes>,
     pub(crate) balls: Option<Box<Balls>>,
+    pub(crate) closures: Option<Box<Closures>>,
     /// `L_q + f` of each four stages, with ball joints.
     force: Vec<Lanes>,
-    masses: Option<Box<Masses>>,
+    alike: Option<Alike>,
     /// With ball joints, all derivatives.
     pub(crate) slopes: Option<Box<Slopes>>,
     hessian: Hessian,
@@ -119,8 +139,9 @@ impl System {
             l_q: lanes(groups * d.dynamic),
             l_v: lanes(groups * d.dynamic),
             balls: has_balls.then(|| Box::new(Balls::new(model, tableau))),
+            closures: (d.constraints > 0).then(|| Box::new(Closures::new(model, tableau))),
             force: lanes(if has_balls { groups * d.dynamic } else { 0 }),
-            masses: by_masses.then(|| Box::new(Masses::new(model, width, count))),
+            alike: by_masses.then(|| Alike::new(model, tableau, width)),
             slopes: None,
             hessian: Hessian::default(),
             matrix: DenseInverse::new(0, 0),
@@ -133,6 +154,9 @@ impl System {
         if self.matrix.matrix.is_empty() {
             self.hessian = Hessian::new(model, self.width);
             self.matrix = DenseInverse::new(self.residual.len(), self.width - self.count);
+            if let Some(closures) = &self.closures {
+                self.matrix.reserve(closures.stride());
+            }
             self.slopes = self.balls.as_ref().map(|_| Box::new(Slopes::new(model, tableau)));
         }
     }
@@ -212,6 +236,9 @@ impl System {
         if let Some(balls) = &mut self.balls {
             balls.begin(state, &mut self.increment);
         }
+        if let Some(closures) = &mut self.closures {
+            closures.begin(at);
+        }
         for k in 0..d.prescribed {
             let start = state.q[nd + k];
             let way = u[d.inputs + k] - start;
@@ -260,6 +287,9 @@ impl System {
                 let from = (&self.force[g * nd..][..nd], &self.l_v[g * nd..][..nd]);
                 balls.take(lengths, g, from, [&mut self.impulse, &mut self.momentum]);
             }
+        }
+        if let Some(closures) = &mut self.closures {
+            magnitude += closures.evaluate(at, &self.increment, self.width);
         }
         magnitude
     }
@@ -320,12 +350,17 @@ impl System {
     /// Writes the residuals of all stages; returns the largest.
     pub(crate) fn find_residuals(&mut self, state: &PreciseState) -> f64 {
         let size = self.find_linear_residuals(state);
-        let Some(balls) = &mut self.balls else { return size };
-        balls.find_residuals(state, [&self.impulse, &self.momentum], &mut self.residual);
+        if let Some(closures) = &self.closures {
+            closures.add_pushes(&mut self.residual);
+        } else if let Some(balls) = &mut self.balls {
+            balls.find_residuals(state, [&self.impulse, &self.momentum], &mut self.residual);
+        } else {
+            return size;
+        }
         largest(&self.residual)
     }
 
-    /// The residuals, as if there were no ball joints.
+    /// The residuals, as if there were neither ball joints nor constraints.
     fn find_linear_residuals(&mut self, state: &PreciseState) -> f64 {
         wide!({
             let (groups, mut sizes) = (self.groups(), Lanes::ZERO);
@@ -376,12 +411,21 @@ impl System {
     /// ```text
     /// ∂R_i/∂Y_k = Σ_j μ_ij h_j (L_qq + f_q)_j μ_jk + μ_ik ((L_qv + f_v)_k − (L_vq)_i) − δ_ik (L_vv)_i / h_i
     /// ```
+    ///
+    /// and what constraints make of it.
     pub(crate) fn fill_matrix(&mut self, at: StepContext<'_>) {
         let n = at.state.q.len();
         if self.balls.is_some() {
             self.fill_turned(at);
             return;
         }
+        self.fill_stages(n);
+        if let Some(closures) = &self.closures {
+            closures.add_curvature(at.model, &mut self.matrix);
+        }
+    }
+
+    fn fill_stages(&mut self, n: usize) {
         wide!({
             match self.groups() {
                 1 => self.fill_groups::<1>(n),
@@ -467,7 +511,9 @@ impl System {
         for iteration in 1..=settings.max_iterations.min(ROUNDS) {
             report.iterations = iteration;
             let magnitude = self.evaluate(workspace, at, inputs);
-            let size = self.find_residuals(state) / (f64::EPSILON * magnitude);
+            let residual = self.find_residuals(state) / (f64::EPSILON * magnitude);
+            let violation = self.closures.as_ref().map_or(0.0, |closures| closures.violation());
+            let size = larger(residual, violation);
             if !size.is_finite() {
                 return Err(StepError::NotFinite { iterations: iteration });
             }
@@ -482,21 +528,35 @@ impl System {
             fresh = iteration == 1 || (!converged && size * rate.powi(PATIENCE) > enough);
             if fresh {
                 self.differentiate(workspace, at, inputs);
+                if let Some(closures) = &mut self.closures {
+                    closures.curve(model, false);
+                }
                 self.fill_matrix(at);
                 report.factorizations += 1;
                 if !self.matrix.invert() {
                     return Err(StepError::NotConverged { iterations: iteration, residual: size });
                 }
+                if let Some(closures) = &mut self.closures {
+                    closures.factor(at, &mut self.matrix)?;
+                    closures.write(&mut report);
+                    report.reciprocal_condition = workspace.kkt.estimates.matrix;
+                }
             }
-            self.matrix.solve(&mut self.residual);
+            match &mut self.closures {
+                Some(closures) => closures.solve(model, &mut self.matrix, &mut self.residual),
+                None => self.matrix.solve(&mut self.residual),
+            }
             let corrections = self.residual.chunks_exact(self.count);
             for (own, corrections) in self.increment.chunks_exact_mut(self.width).zip(corrections) {
                 own.iter_mut().zip(corrections).for_each(|(y, c)| *y -= c);
             }
-            report.residual = size;
+            (report.residual, report.constraint_residual) = (residual, violation);
             if converged {
                 if self.balls.is_none() {
                     self.correct_impulses(n);
+                    if let Some(closures) = &mut self.closures {
+                        closures.follow(model, &self.residual);
+                    }
                 } else if size > STALE {
                     self.evaluate(workspace, at, inputs);
                     self.find_residuals(state);
@@ -508,15 +568,16 @@ impl System {
         Err(StepError::NotConverged { iterations: report.iterations, residual: previous })
     }
 
-    /// Corrects all stages with the mass matrices of the guess; `None` if that takes too long.
-    pub(super) fn correct_by_masses(
+    /// Corrects all stages with the mass matrices of the guess, or, with constraints, with the system of its middle;
+    /// `None` if that takes too long.
+    pub(super) fn correct_alike(
         &mut self,
         workspace: &mut Workspace,
         at: StepContext<'_>,
         inputs: &[f64],
     ) -> Option<StepReport> {
-        let StepContext { model, settings, state, .. } = at;
-        let mut masses = self.masses.take()?;
+        let StepContext { settings, state, .. } = at;
+        let mut alike = self.alike.take()?;
         let enough = match settings.precision {
             Precision::Exact => settings.precision.residual(),
             Precision::Fast => settings.precision.residual() * OF_LIGHT_BODIES,
@@ -527,7 +588,9 @@ impl System {
         for iteration in 1..=settings.max_iterations {
             report.iterations = iteration;
             let magnitude = self.evaluate(workspace, at, inputs);
-            let size = self.find_residuals(state) / (f64::EPSILON * magnitude);
+            let residual = self.find_residuals(state) / (f64::EPSILON * magnitude);
+            let violation = self.closures.as_ref().map_or(0.0, |closures| closures.violation());
+            let size = larger(residual, violation);
             if !size.is_finite() {
                 break;
             }
@@ -537,16 +600,19 @@ impl System {
                 _ => size,
             };
             if iteration == 1 {
-                self.factor_masses(&mut masses, workspace, at, inputs);
                 report.factorizations = 1;
+                if !self.factor_alike(&mut alike, workspace, at, inputs) {
+                    break;
+                }
             }
-            self.correct_with(model, &mut masses, iteration == 1);
-            report.residual = size;
+            self.correct_with(workspace, at.model, &mut alike, iteration == 1);
+            (report.residual, report.constraint_residual) = (residual, violation);
             if left <= enough || (size > SLOW * previous && size <= CHORD_FLOOR) {
                 if size > STALE {
                     self.evaluate(workspace, at, inputs);
                     self.find_residuals(state);
                 }
+                workspace.kkt.estimates.write(&mut report);
                 solved = Some(report);
                 break;
             }
@@ -556,8 +622,25 @@ impl System {
             }
             previous = size;
         }
-        self.masses = Some(masses);
+        self.alike = Some(alike);
         solved
+    }
+
+    /// Factors what is alike in all rounds at the last evaluation; false if that is singular.
+    fn factor_alike(
+        &mut self,
+        alike: &mut Alike,
+        workspace: &mut Workspace,
+        at: StepContext<'_>,
+        inputs: &[f64],
+    ) -> bool {
+        match alike {
+            Alike::Masses(masses) => {
+                self.factor_masses(masses, workspace, at, inputs);
+                true
+            }
+            Alike::Middle(middle) => middle.factor(workspace, at, &self.increment, self.width),
+        }
     }
 
     /// Factors the mass matrices at the last evaluation.
@@ -581,8 +664,32 @@ impl System {
         masses.factor(at.model);
     }
 
-    /// Corrects the increments with the mass matrices.
-    fn correct_with(&mut self, model: &Model, masses: &mut Masses, is_first: bool) {
+    /// Corrects the increments, and the impulses of constraints.
+    fn correct_with(
+        &mut self,
+        workspace: &mut Workspace,
+        model: &Model,
+        alike: &mut Alike,
+        is_first: bool,
+    ) {
+        let changes = match (alike, &mut self.closures) {
+            (Alike::Middle(middle), Some(closures)) => {
+                middle.correct(workspace, model, closures, &self.residual, is_first)
+            }
+            (Alike::Masses(masses), _) => {
+                self.change_by_masses(model, masses, is_first);
+                &self.residual
+            }
+            (Alike::Middle(_), None) => return,
+        };
+        let changes = changes.chunks_exact(self.count);
+        for (own, changes) in self.increment.chunks_exact_mut(self.width).zip(changes) {
+            own.iter_mut().zip(changes).for_each(|(y, change)| *y += change);
+        }
+    }
+
+    /// From the residuals to changes of the increments, with the mass matrices.
+    fn change_by_masses(&mut self, model: &Model, masses: &mut Masses, is_first: bool) {
         for g in 0..self.groups() {
             let first = g * Lanes::COUNT;
             for (right, residual) in
@@ -607,10 +714,6 @@ impl System {
             masses.secants.forget();
         }
         masses.secants.improve(&mut self.residual);
-        let corrections = self.residual.chunks_exact(self.count);
-        for (own, corrections) in self.increment.chunks_exact_mut(self.width).zip(corrections) {
-            own.iter_mut().zip(corrections).for_each(|(y, change)| *y += change);
-        }
     }
 
     /// Takes second derivatives at the last evaluation.
@@ -672,12 +775,13 @@ impl System {
         }
     }
 
-    /// Writes velocities and forces, stage by stage, and their sums over the step.
+    /// Writes velocities and forces, stage by stage, and their sums over the step, with those of constraints.
     pub(super) fn finish(
-        &self,
+        &mut self,
         model: &Model,
         motion: &mut [f64],
-        [increment, impulse]: [&mut [f64]; 2],
+        redundant: u32,
+        [increment, impulse, multipliers]: [&mut [f64]; 3],
     ) -> Result<(), StepError> {
         let (count, width, nd) = (self.count, self.width, increment.len());
         if !(largest(&self.increment) <= std::f64::consts::PI) {
@@ -695,6 +799,9 @@ impl System {
                 motion[i * nd + a] = self.rates[i] * turns[i];
                 motion[(count + i) * nd + a] = self.rates[i] * impulses[i];
             }
+        }
+        if let Some(closures) = &mut self.closures {
+            closures.finish(model, redundant, [impulse, multipliers]);
         }
         let Some(balls) = &self.balls else { return Ok(()) };
         balls.finish(impulse);

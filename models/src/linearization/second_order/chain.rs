@@ -1,15 +1,16 @@
 //! Weighted second derivatives of collocation, and of periods of several steps.
 
 use plantd_math::rotation::{self, Chart, Turn};
-use plantd_math::rows::{Term, add_product, add_rows};
+use plantd_math::rows::{Term, add_product, add_rows, padded};
 use plantd_math::scalar::{Dual, Scalar};
 use plantd_math::spatial::{Mat3, Vec3, three};
 
+use crate::constraints::closure::Closure;
 use crate::integrator::blocks::StepBlocks;
 use crate::integrator::collocation::slopes::Slopes;
 use crate::integrator::report::StepError;
 use crate::integrator::scheme::Tableau;
-use crate::linearization::linearize::{Linearization, Part, StageTangents};
+use crate::linearization::linearize::{Linearization, NodeTangents, Part, StageTangents};
 use crate::linearization::second_order::contraction::Contraction;
 use crate::model::mechanism::Model;
 
@@ -114,6 +115,41 @@ impl StageTangents {
     }
 }
 
+impl NodeTangents {
+    /// Finds `ν` from `−o_Y`, and adds `−Gᵀ ν` to that.
+    fn add_adjoint(
+        &self,
+        model: &Model,
+        stages: &StageTangents,
+        [z_p, weights_multipliers]: [&[f64]; 2],
+        adjoint: &mut [f64],
+    ) -> Vec<f64> {
+        let (count, nc) = (stages.tableau.weights.len(), model.dimensions.constraints);
+        let n = model.dimensions.coordinates();
+        let width = padded(count * nc);
+        let row = |j: usize, c: usize| &self.jacobians[(j * nc + c) * n..][..n];
+        let each = || (0..count).flat_map(|j| (0..nc).map(move |c| (j, c)));
+        let direct = |(j, c): (usize, usize)| {
+            let pulled: f64 = z_p.iter().zip(row(j, c)).map(|(z, entry)| z * entry).sum();
+            weights_multipliers[c] - pulled
+        };
+        let mut nu: Vec<f64> = each().map(direct).collect();
+        for (k, o) in adjoint.iter().enumerate() {
+            let responses = &self.responses[k * width..][..count * nc];
+            nu.iter_mut().zip(responses).for_each(|(nu, response)| *nu += response * o);
+        }
+        let mut schur = self.schur.clone();
+        schur.solve_transposed(&mut nu);
+        for ((j, c), nu) in each().zip(&nu) {
+            let reach = &stages.tableau.reach[(j + 1) * count..][..count];
+            for (own, entry) in adjoint.chunks_exact_mut(count).zip(row(j + 1, c)) {
+                own.iter_mut().zip(reach).for_each(|(o, kappa)| *o -= nu * entry * kappa);
+            }
+        }
+        nu
+    }
+}
+
 impl Contraction {
     /// The sum over the steps of a period: with the tangent `T_j` of the parameters of step `j`, and the
     /// weights `z_j = A_jᵀ z_j+1 + (∂λ_j/∂x_j)ᵀ w` of where it begins,
@@ -164,7 +200,20 @@ impl Contraction {
     /// The sum for a step of collocation. With the adjoint `μ = −(∂R/∂Y)⁻ᵀ (z_x + (Σ ∂P/∂Y)ᵀ z_p)` and
     /// the weights `w_j = z_p + Σ_i μ_ij μ_i` of the impulses, stage `j` contributes the derivative of the
     /// Hessian of `L` along `(h_j w_j, −μ_j)`, and of its forces what `h_j w_j` weighs.
-    pub(super) fn contract_stages(&mut self, model: &Model, stages: &StageTangents, z: &[f64]) {
+    ///
+    /// With constraints there are weights `ν` of the equations at the nodes, too: of `o_Y`, what is in brackets
+    /// above, and of `o_Λ = z_λ − Dh z_p`
+    ///
+    /// ```text
+    /// Sᵀ ν = o_Λ − (J⁻¹ B)ᵀ o_Y        μ = −J⁻ᵀ (o_Y + Gᵀ ν)
+    /// ```
+    pub(super) fn contract_stages(
+        &mut self,
+        model: &Model,
+        stages: &StageTangents,
+        z: &[f64],
+        weights_multipliers: &[f64],
+    ) {
         let layout = self.scratch.layout;
         let (nd, n, ni, stride) = (layout.nd, layout.n(), layout.ni, layout.stride);
         let (size, count) = (layout.count(), stages.tableau.weights.len());
@@ -179,6 +228,12 @@ impl Contraction {
             let slopes = z_p.iter().enumerate().map(|(a, z)| z * stages.slopes[a * count * nd + k]);
             *mu = -(weights[k / count] + slopes.sum::<f64>());
         }
+        let nu = match &stages.nodes {
+            Some(nodes) => {
+                nodes.add_adjoint(model, stages, [z_p, weights_multipliers], &mut adjoint)
+            }
+            None => Vec::new(),
+        };
         stages.matrix.solve_transposed(&mut adjoint);
         if !model.orientations.is_empty() {
             self.contract_turned_stages(model, stages, &adjoint, z);
@@ -186,6 +241,9 @@ impl Contraction {
         }
 
         self.quadratic.clear();
+        if let Some(nodes) = &stages.nodes {
+            self.contract_nodes(model, stages, nodes, z_p, [&adjoint, &nu]);
+        }
         let [mut tangent, mut product] = [0; 2].map(|_| vec![0.0; 2 * n * stride]);
         for j in 0..count {
             let length = stages.tableau.weights[j] * stages.time_step_s;
@@ -251,6 +309,80 @@ impl Contraction {
                 let factors = (0..2 * n).map(by_midpoint);
                 add_product(row, &tangent, stride, factors, &mut scratch.terms);
             }
+        }
+    }
+
+    /// What constraints add. At a node the impulses are weighed by `β_j = z_p + Σ_i (1 − κ_ji) μ_i`, and
+    ///
+    /// ```text
+    /// q̃'ᵀ (ν_j·D²h − Λ_j·D³h β_j) q̃' − (Λ_j'·D²h β_j q̃' + its transpose)
+    /// ```
+    ///
+    /// are dual parts of `Dh` and of its derivative along `β_j`.
+    fn contract_nodes(
+        &mut self,
+        model: &Model,
+        stages: &StageTangents,
+        nodes: &NodeTangents,
+        z_p: &[f64],
+        [adjoint, nu]: [&[f64]; 2],
+    ) {
+        let layout = self.scratch.layout;
+        let (nd, n, nc, stride) = (layout.nd, layout.n(), layout.nc, layout.stride);
+        let (size, count) = (layout.count(), stages.tableau.weights.len());
+        let mut closure = Closure::<Dual>::new(model);
+        let mut hessian = vec![Dual::ZERO; n * n];
+        let [mut tangent, mut product] = [0; 2].map(|_| vec![0.0; (n + nc) * stride]);
+        for j in 0..=count {
+            let reach = &stages.tableau.reach[j * count..][..count];
+            tangent.fill(0.0);
+            for b in 0..n {
+                let row = &mut tangent[b * stride..][..stride];
+                for (column, part) in layout.moves(b, stages.tableau.ends[j]) {
+                    row[column] = part;
+                }
+                if b < nd {
+                    let moved = reach.iter().enumerate().map(|(k, m)| (*m, b * count + k));
+                    add_rows(row, &stages.tangent, stride, &moved.collect::<Vec<_>>());
+                }
+            }
+            let own = |numbers: &[f64], c: usize| -> f64 {
+                if j < count { numbers[j * nc + c] } else { 0.0 }
+            };
+            let q: Vec<Dual> = (0..n)
+                .map(|a| {
+                    let coupled = |i: usize| (1.0 - reach[i]) * adjoint[a * count + i];
+                    let along = || z_p[a] + (0..count).map(coupled).sum::<f64>();
+                    let beta = if a < nd && j < count { along() } else { 0.0 };
+                    Dual::new(nodes.q[j * n + a], beta)
+                })
+                .collect();
+            let multipliers: Vec<Dual> = (0..nc)
+                .map(|c| {
+                    let nu = if j > 0 { nu[(j - 1) * nc + c] } else { 0.0 };
+                    Dual::new(own(&nodes.multipliers, c), -nu)
+                })
+                .collect();
+            closure.evaluate(model, &q, &[]);
+            closure.differentiate(model, &q);
+            closure.hessian(model, &q, &multipliers, &mut hessian);
+            if j < count {
+                let from = &nodes.tangent[j * nc * stride..][..nc * stride];
+                tangent[n * stride..].copy_from_slice(from);
+            }
+            product.fill(0.0);
+            let terms = &mut self.scratch.terms;
+            for (row, target) in product.chunks_exact_mut(stride).enumerate() {
+                let weight = |c: usize| match (row < n, c < n) {
+                    (true, true) => -hessian[row * n + c].eps,
+                    (true, false) => -closure.jacobian[(c - n) * n + row].eps,
+                    (false, true) => -closure.jacobian[(row - n) * n + c].eps,
+                    (false, false) => 0.0,
+                };
+                add_product(target, &tangent, stride, (0..n + nc).map(weight), terms);
+            }
+            let sum = &mut self.quadratic.sum[..size * stride];
+            add_transposed_product(sum, &tangent, &product, stride, terms);
         }
     }
 

@@ -228,7 +228,7 @@ impl Contraction {
         weights_multipliers: &[f64],
     ) -> Result<(), StepError> {
         if let Some(stages) = first.stages() {
-            self.contract_stages(model, stages, weights_x);
+            self.contract_stages(model, stages, weights_x, weights_multipliers);
             return Ok(());
         }
         first.write_tangent(self.scratch.layout.stride, &mut self.scratch.tangent);
