@@ -388,7 +388,7 @@ def measure_growth(plantd):
 
 ERRORS = [1e-2, 1e-4, 1e-6, 1e-8, 1e-10]
 CASES = [("P", 2), ("P", 10), ("D", 2), ("D", 10), ("S", 2), ("S", 10), ("C4", 2)]
-ROBOT_CASES = [("panda", 1), ("go1", 1), ("g1", 1), ("B7", 1), ("go1-feet", 1)]
+ROBOT_CASES = [("panda", 1), ("go1", 1), ("g1", 1), ("B7", 1), ("go1-feet", 0.2)]
 HIGH_ORDERS = [("plantd", f"order-{order}{to}") for order in (4, 6, 8, 12) for to in ("", "-fast")]
 FIXED_STEP = [PLANTD, *HIGH_ORDERS]
 FIXED_STEP += [m for m in STEP_METHODS if m[0] not in ("plantd", "CasADi C")]
@@ -417,7 +417,7 @@ def curve(drivers, name, method, end, reference):
     if method in ("dop853", "rk3", "rk5"):
         commands = [(f"{method}:{10 ** -(k / 2):.3e}", 0.1, round(end / 0.1)) for k in range(2, 28)]
     else:
-        counts = [round(end * 2 * 2 ** (k / 2)) for k in range(46)]
+        counts = sorted({max(1, round(end * 2 * 2 ** (k / 2))) for k in range(46)})
         commands = [(method, end / steps, steps) for steps in counts]
     for what, dt, steps in commands:
         try:

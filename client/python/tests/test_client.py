@@ -140,7 +140,7 @@ def test_methods(client):
     assert (chosen.order, chosen.substeps) != (2, 1)
     assert plant.accuracy is None
     with pytest.raises(plantd.PlantdError) as refused:
-        client.create_plant("four-bar", order=12)
+        client.create_plant("four-bar", order=10)
     assert refused.value.violations[0].field == "settings.order"
     with pytest.raises(TypeError, match="odrer"):
         client.create_plant("four-bar", odrer=4)

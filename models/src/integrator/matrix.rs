@@ -47,7 +47,9 @@ impl Workspace {
     /// The constraint Jacobian at the end, by the increment.
     fn differentiate_end(&mut self, model: &Model) {
         self.constraints.end.differentiate(model, &self.step.q_end);
-        self.turn_end_jacobian(model);
+        if !model.orientations.is_empty() {
+            self.turn_end_jacobian(model);
+        }
     }
 
     /// Whether the pivots of constraints are sound at rest, where they are known to be regular.

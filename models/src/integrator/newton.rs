@@ -402,7 +402,9 @@ impl Workspace {
             self.place_end(model, state);
             self.constraints.end.complete(model, &self.step.q_end, &self.balls.end);
         }
-        self.turn_end_jacobian(model);
+        if !model.orientations.is_empty() {
+            self.turn_end_jacobian(model);
+        }
     }
 }
 
