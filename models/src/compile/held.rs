@@ -55,7 +55,10 @@ impl Model {
         };
         let are_last = limbs.iter().all(|limb| limb.above.iter().all(|above| !is_held(above)));
         let others = (0..d.dynamic).filter(|k| !is_held(k));
-        if !are_last || others.clone().any(|k| proper(k).iter().any(is_held)) {
+        // Nor have two the same coordinates: equations that move the same end may move different others.
+        let owned: usize = limbs.iter().map(|limb| limb.coordinates.len()).sum();
+        let are_apart = owned == (0..d.dynamic).filter(is_held).count();
+        if !are_last || !are_apart || others.clone().any(|k| proper(k).iter().any(is_held)) {
             return None;
         }
         let rest = (0..d.dynamic).map(|k| if is_held(&k) { BTreeSet::new() } else { proper(k) });
