@@ -221,14 +221,14 @@ ROBOT_RATIOS = [
     (PLANTD_AB, ("Pinocchio", "euler-ab")),
 ]
 TABLE = ["P", "D", "S", "L"]
-TABLE += [f"C{2**k}" for k in range(8)] + ["T7", "T15", "T30", "T63"]
+TABLE += [f"C{2**k}" for k in range(8)] + ["T7", "T15", "T30", "T63", "Z32", "Z128"]
 GROWTH = ["H128", "H256", "H512", "H1024"]
 
 # Mechanism, what plantd is compared with, and the ratio that is aimed at.
 STEP_GOALS = [(name, ("Pinocchio", "rk4"), 0.25) for name in ("C8", "C32", "C128")]
 STEP_GOALS += [(name, ("MuJoCo", "euler"), 1.0) for name in ("C8", "C32", "C128")]
 STEP_GOALS += [("T30", ("Pinocchio", "rk4"), 0.3), ("T30", ("MuJoCo", "euler"), 1.5)]
-AB_GOALS = [(name, ("Pinocchio", "euler-ab"), 0.6) for name in ("C8", "C32", "T30")]
+AB_GOALS = [(name, ("Pinocchio", "euler-ab"), 0.6) for name in ("C8", "C32", "T30", "Z32", "Z128")]
 AB_GOALS += [("C8", ("CasADi C", "euler-ab"), 1.2), ("T30", ("CasADi C", "euler-ab"), 0.4)]
 AB_GOALS += [(name, ("MuJoCo", "euler-ab"), 0.1) for name in ("C8", "C32", "T30")]
 
@@ -237,7 +237,7 @@ def time_step(name):
     """0.01 s; shorter for robots, and for long chains, whose links swing faster."""
     if name in ROBOTS:
         return 0.002
-    return min(0.01, 0.08 / int(name[1:])) if name[0] in "CH" else 0.01
+    return min(0.01, 0.08 / int(name[1:])) if name[0] in "CHZ" else 0.01
 
 
 def applies(name, method):

@@ -85,6 +85,15 @@ def hanging_chain(n):
     return chain(n) | dict(name=f"H{n}", q0=[math.pi / 6] + [0.0] * (n - 1))
 
 
+def chain_in_space(n):
+    """The same with hinges across each other: about y and x by turns."""
+    m = hanging_chain(n)
+    for b in m["bodies"][1::2]:
+        b["axis"] = [1, 0, 0]
+    q0 = [math.pi / 6, math.pi / 6] + [0.0] * (n - 2)
+    return m | dict(name=f"Z{n}", q0=q0)
+
+
 def tree(n):
     """Balanced binary tree of n boxes, hinged about alternating axes."""
     axes = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
@@ -303,7 +312,7 @@ def standing(name):
 
 
 SINGLE = {"P": pendulum, "D": double_pendulum, "S": spherical_pendulum, "L": four_bar}
-FAMILIES = {"B": ball_tree, "K": ball_chain, "C": chain, "H": hanging_chain, "T": tree, "X": scissor}
+FAMILIES = {"B": ball_tree, "K": ball_chain, "C": chain, "H": hanging_chain, "T": tree, "X": scissor, "Z": chain_in_space}
 
 
 def named(name):

@@ -338,3 +338,31 @@ fn limbs_that_others_need_are_no_limbs() {
     sketch.chain("f3", at, &[(Z, [0.0, 0.0, -0.1])]);
     assert_eq!(sketch.compile("").solver, Solver::Tree);
 }
+
+/// One end that is held twice, by equations that move different coordinates above it, is no limb: the last
+/// coordinate cannot go with both.
+#[test]
+fn an_end_that_is_held_twice_is_no_limb() {
+    let links =
+        [(X, [0.0; 3]), (Y, [0.0, 0.0, -0.3]), (X, [0.1, 0.0, -0.3]), (Y, [0.0, 0.1, -0.3])];
+    let hold = |sketch: &mut Sketch, frame: &str, length: f64| {
+        writeln!(
+            sketch.constraints,
+            "[[constraints]]\nname = \"to-{frame}\"\ntype = \"distance\"\nlength = {length:?}\n\
+             a = {{ frame = \"{frame}\", at = [0.0, 0.0, 0.0] }}\n\
+             b = {{ frame = \"f3\", at = [0.0, 0.0, -0.2] }}"
+        )
+        .unwrap();
+    };
+    let mut sketch = Sketch::default();
+    sketch.chain("world", [0.0; 3], &links);
+    hold(&mut sketch, "world", (0.1_f64 * 0.1 + 0.1 * 0.1 + 1.1 * 1.1).sqrt());
+    assert_eq!(sketch.compile("").solver, Solver::Held);
+    hold(&mut sketch, "f1", (0.1_f64 * 0.1 + 0.1 * 0.1 + 0.8 * 0.8).sqrt());
+    let model = Arc::new(sketch.compile(""));
+    assert!(model.held.is_none());
+    let mut plant = Plant::new(Arc::clone(&model), Settings::new(&model)).unwrap();
+    for _ in 0..20 {
+        plant.step(&[0.1, -0.2, 0.1, 0.0]).unwrap();
+    }
+}
