@@ -145,9 +145,9 @@ impl HeldLimbs {
         lambda: &mut [f64],
         [stride, columns]: [usize; 2],
     ) {
-        in_eights(LiftRows { limbs: self, held, x, lambda, stride, columns });
+        in_eights(PassRows::<true> { limbs: self, held, x, lambda, stride, columns });
         self.rest.solve_rows(&held.rest, x, stride, columns);
-        in_eights(LowerRows { limbs: self, held, x, lambda, stride, columns });
+        in_eights(PassRows::<false> { limbs: self, held, x, lambda, stride, columns });
     }
 
     /// Takes the entries of `K` of which no coordinate is a limb's.
@@ -599,8 +599,8 @@ impl InEights for Lower<'_> {
     }
 }
 
-/// The first half of solutions side by side.
-struct LiftRows<'a> {
+/// One half of solutions side by side: `UP` to the coordinates above, or down from their solution.
+struct PassRows<'a, const UP: bool> {
     limbs: &'a HeldLimbs,
     held: &'a Held,
     x: &'a mut [f64],
@@ -609,7 +609,7 @@ struct LiftRows<'a> {
     columns: usize,
 }
 
-impl InEights for LiftRows<'_> {
+impl<const UP: bool> InEights for PassRows<'_, UP> {
     type Output = ();
 
     #[inline(always)]
@@ -621,35 +621,11 @@ impl InEights for LiftRows<'_> {
             for column in (0..columns).step_by(LANES) {
                 let (above, own) = (&mut above[column..], &mut own[column..]);
                 let rows = [own, &mut lambda[column..]];
-                of_limb!(limb, limb => limb.lift_rows::<E>(plan, above, rows, stride));
-            }
-        }
-    }
-}
-
-/// The second half.
-struct LowerRows<'a> {
-    limbs: &'a HeldLimbs,
-    held: &'a Held,
-    x: &'a mut [f64],
-    lambda: &'a mut [f64],
-    stride: usize,
-    columns: usize,
-}
-
-impl InEights for LowerRows<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn run<E: Eight>(self) {
-        let Self { limbs, held, x, lambda, stride, columns } = self;
-        for (plan, limb) in held.limbs.iter().zip(&limbs.limbs) {
-            let (above, own) = x.split_at_mut(plan.coordinates.start * stride);
-            let lambda = &mut lambda[plan.equations.start * stride..];
-            for column in (0..columns).step_by(LANES) {
-                let (above, own) = (&above[column..], &mut own[column..]);
-                let rows = [own, &mut lambda[column..]];
-                of_limb!(limb, limb => limb.lower_rows::<E>(plan, above, rows, stride));
+                of_limb!(limb, limb => if UP {
+                    limb.lift_rows::<E>(plan, above, rows, stride);
+                } else {
+                    limb.lower_rows::<E>(plan, above, rows, stride);
+                });
             }
         }
     }

@@ -360,6 +360,13 @@ impl System {
         largest(&self.residual)
     }
 
+    /// The largest residual and violation of a constraint, in units of round-off.
+    fn sizes(&mut self, state: &PreciseState, magnitude: f64) -> [f64; 2] {
+        let residual = self.find_residuals(state) / (f64::EPSILON * magnitude);
+        let violation = self.closures.as_ref().map_or(0.0, |closures| closures.violation());
+        [residual, violation]
+    }
+
     /// The residuals, as if there were neither ball joints nor constraints.
     fn find_linear_residuals(&mut self, state: &PreciseState) -> f64 {
         wide!({
@@ -511,8 +518,7 @@ impl System {
         for iteration in 1..=settings.max_iterations.min(ROUNDS) {
             report.iterations = iteration;
             let magnitude = self.evaluate(workspace, at, inputs);
-            let residual = self.find_residuals(state) / (f64::EPSILON * magnitude);
-            let violation = self.closures.as_ref().map_or(0.0, |closures| closures.violation());
+            let [residual, violation] = self.sizes(state, magnitude);
             let size = larger(residual, violation);
             if !size.is_finite() {
                 return Err(StepError::NotFinite { iterations: iteration });
@@ -588,8 +594,7 @@ impl System {
         for iteration in 1..=settings.max_iterations {
             report.iterations = iteration;
             let magnitude = self.evaluate(workspace, at, inputs);
-            let residual = self.find_residuals(state) / (f64::EPSILON * magnitude);
-            let violation = self.closures.as_ref().map_or(0.0, |closures| closures.violation());
+            let [residual, violation] = self.sizes(state, magnitude);
             let size = larger(residual, violation);
             if !size.is_finite() {
                 break;
