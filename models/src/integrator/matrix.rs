@@ -186,7 +186,7 @@ impl Workspace {
 }
 
 /// Where the KKT system is factored.
-fn linearized<'a>(
+pub(crate) fn linearized<'a>(
     model: &'a Model,
     settings: &Settings,
     mechanics: &'a mut Mechanics,

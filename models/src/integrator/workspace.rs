@@ -8,6 +8,7 @@ use crate::integrator::midpoint::Midpoint;
 use crate::integrator::response::Response;
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
+use crate::kkt::space::columns::OfBall;
 use crate::kkt::system::KktSystem;
 use crate::lagrangian::generators::Flanks;
 use crate::lagrangian::nudge::Nudge;
@@ -105,6 +106,8 @@ pub(crate) struct Tangents {
     pub(crate) end_slopes: Vec<f64>,
     /// Of joints, with ball joints.
     pub(crate) flanks: Vec<Flanks>,
+    /// What ball joints have of themselves.
+    pub(crate) balls: Vec<OfBall>,
     pub(crate) terms: Vec<Term>,
 }
 
@@ -141,6 +144,7 @@ impl Workspace {
                     Flanks::default();
                     if has_balls { model.dynamics.joints.len() } else { 0 }
                 ],
+                balls: vec![OfBall::ZERO; model.orientations.len()],
                 terms: Vec::with_capacity(nd.max(nc)),
             },
             nudge: Nudge::new(model),

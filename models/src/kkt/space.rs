@@ -20,6 +20,7 @@
 //! one origin, the solution loses digits in long chains (up to 1e-11 of it in one of 64 hinges), which the next
 //! correction makes good.
 
+pub(crate) mod columns;
 #[cfg(test)]
 mod tests;
 
@@ -63,6 +64,8 @@ struct Limb {
     /// Where the sums of the limbs are that hang from its lowest joint.
     carries: Option<usize>,
     hangs_from: Option<Fork>,
+    /// Behind the last axis of all that hangs from it.
+    end: usize,
 }
 
 /// Where limbs meet.
@@ -187,6 +190,14 @@ fn inverse<const W: usize>(d: &[[f64; W]; W]) -> ([[f64; W]; W], [f64; W]) {
 fn limbs(tree: &Tree) -> (Vec<Limb>, Vec<Group>, usize) {
     let joints = &tree.joints[..];
     let mut children = vec![0; joints.len()];
+    // Behind the last axis below each.
+    let mut ends: Vec<usize> = (1..=joints.len()).collect();
+    for (i, joint) in joints.iter().enumerate().rev() {
+        let end = ends[i];
+        if let Some(parent) = ends.get_mut(joint.parent) {
+            *parent = end.max(*parent);
+        }
+    }
     // Forks on the way to each joint, which are the places of its own one: what is below a joint is done
     // with before the next one needs the place.
     let mut forks = vec![0; joints.len()];
@@ -218,6 +229,7 @@ fn limbs(tree: &Tree) -> (Vec<Limb>, Vec<Group>, usize) {
                 place: forks[parent],
                 is_first: !std::mem::replace(seen, true),
             }),
+            end: ends[lowest],
         });
         end = top;
     }
@@ -298,8 +310,20 @@ impl InEights for Factor<'_> {
     fn run<E: Eight>(self) -> SmallestPivot {
         let Self { recursion, curvature, added, inertia, step } = self;
         recursion.generate::<E>(curvature, &step, added);
-        recursion.eliminate::<E>(|axis| inertia[axis] * step.inverse.abs())
+        recursion.eliminate::<E>(|axis| inertia[axis] * step.inverse.abs(), &mut ())
     }
+}
+
+/// Looks at groups before they are eliminated.
+trait Watch<E> {
+    /// At the generators of a group, and at `A` where it is not zero.
+    fn see(&mut self, at: usize, group: &Group, axes: &[Generators], sums: Option<&Sums<E>>);
+}
+
+/// Nobody looks.
+impl<E> Watch<E> for () {
+    #[inline(always)]
+    fn see(&mut self, _: usize, _: &Group, _: &[Generators], _: Option<&Sums<E>>) {}
 }
 
 impl SpatialRecursion {
@@ -333,7 +357,11 @@ impl SpatialRecursion {
 
     /// From the leaves to the root.
     #[inline(always)]
-    fn eliminate<E: Eight>(&mut self, inertia: impl Fn(usize) -> f64) -> SmallestPivot {
+    fn eliminate<E: Eight>(
+        &mut self,
+        inertia: impl Fn(usize) -> f64,
+        watch: &mut impl Watch<E>,
+    ) -> SmallestPivot {
         let mut smallest = SmallestPivot::NONE;
         for limb in &self.limbs {
             let mut sums = match limb.carries {
@@ -348,6 +376,8 @@ impl SpatialRecursion {
                     smallest.see(first + axis, pivot, entry.abs().max(inertia(first + axis)));
                 };
                 let is_root = limb.hangs_from.is_none() && at + 1 == limb.groups.end;
+                let axes = &self.axes[group.axes.clone()];
+                watch.see(at, group, axes, carries.then_some(&sums));
                 let sums = &mut sums;
                 match &mut self.axes[group.axes.clone()] {
                     [a] => eliminate([a], within, sums, carries, is_root, see),

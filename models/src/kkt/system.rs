@@ -15,8 +15,9 @@ use crate::kkt::held::HeldLimbs;
 use crate::kkt::loops::{Mechanism, Multifrontal, Scales};
 use crate::kkt::planar::PlanarRecursion;
 use crate::kkt::schur::SchurComplement;
+use crate::kkt::space::columns::{Columns, Own, Rows};
 use crate::kkt::space::{Added, SpatialRecursion};
-use crate::lagrangian::generators::MatrixKind;
+use crate::lagrangian::generators::{MatrixKind, Step};
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::planar::PlanarTree;
 use crate::lagrangian::turning::Weights;
@@ -35,6 +36,8 @@ pub(crate) struct KktSystem {
     /// How ball joints weigh their rows and columns.
     pub(crate) balls: Vec<Weights>,
     pub(crate) estimates: Estimates,
+    /// For a linearization by generators in space.
+    columns: Option<Box<Columns>>,
 }
 
 /// Factors of `K`.
@@ -113,8 +116,14 @@ impl KktSystem {
     /// Room for the factors, by what suits the model; columns of the Schur complement are `stride` apart.
     pub(crate) fn new(model: &Model, stride: usize) -> Self {
         let nd = model.dimensions.dynamic;
+        let factored = Factored::new(model);
+        let columns = match &factored.recursion {
+            Recursion::Spatial(recursion) => Some(Box::new(recursion.columns())),
+            _ => None,
+        };
         Self {
-            factored: Factored::new(model),
+            factored,
+            columns,
             schur: SchurComplement::new(model, stride),
             diagonal: vec![0.0; nd],
             balls: vec![Weights::REST; model.orientations.len()],
@@ -200,6 +209,24 @@ impl KktSystem {
         } else {
             self.judge(pivot, singular_below).map(|()| true)
         }
+    }
+
+    /// Factors by generators in space at the last second derivatives, with the derivatives of the step: false where there is no such recursion.
+    pub(crate) fn linearize_in_space(
+        &mut self,
+        at: Linearized<'_>,
+        own: Own<'_>,
+        rows: Rows<'_>,
+    ) -> Result<bool, SmallestPivot> {
+        let Recursion::Spatial(recursion) = &mut self.factored.recursion else { return Ok(false) };
+        let Linearized { model, mechanics, time_step_s, singular_below, .. } = at;
+        let added = Added { diagonal: &self.diagonal, balls: &self.balls };
+        let step = (&model.conditioning.inertia[..], Step::new(time_step_s, MatrixKind::Newton));
+        self.factored.valid = Factors::Recursion;
+        let curvature = &mechanics.curvature;
+        let columns = self.columns.get_or_insert_with(|| Box::new(recursion.columns()));
+        let pivot = recursion.linearize(columns, curvature, (added, own), step, rows);
+        self.judge(pivot, singular_below).map(|()| true)
     }
 
     /// Factors `K`, which is filled, by the tree LU. The error is a pivot that is too small.

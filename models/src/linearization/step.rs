@@ -4,12 +4,16 @@ use plantd_math::rows::{add_rows, add_rows_portable, padded};
 use plantd_math::simd::{wide, widest};
 use plantd_math::spatial::three;
 
+use crate::integrator::matrix::linearized;
 use crate::integrator::report::StepError;
+use crate::integrator::settings::Settings;
 use crate::integrator::workspace::{StepContext, Tangents, Workspace};
+use crate::kkt::space::columns::{Own, Rows};
 use crate::kkt::system::Recursion;
 use crate::kkt::{loops, planar};
 use crate::lagrangian::planar::PlanarTree;
 use crate::linearization::linearize::{Kind, Linearization};
+use crate::model::mechanism::Model;
 
 impl Workspace {
     /// Linearizes at the solution in the workspace.
@@ -30,7 +34,8 @@ impl Workspace {
             Recursion::Planar(_) => self.linearize_planar(at, out)?,
             Recursion::Loops(_) => self.linearize_loops(at, out)?,
             Recursion::Held(_) => self.linearize_held(at, out)?,
-            Recursion::None | Recursion::Spatial(_) => false,
+            Recursion::Spatial(_) => self.linearize_space(at, out)?,
+            Recursion::None => false,
         };
         if is_done {
             out.solved.remember(self, at);
@@ -74,7 +79,8 @@ impl Workspace {
         if !self.factor_recursion(model, at.settings)? {
             return Ok(false);
         }
-        self.fill_inputs(at, out);
+        fill_inputs(at, out);
+        self.fill_diagonals(model, at.settings);
         let tree = self.mid.mechanics.planar.as_deref().and_then(PlanarTree::many);
         let (Some(tree), Some(joints), Recursion::Planar(recursion)) =
             (tree, &model.planar, &mut self.kkt.factored.recursion)
@@ -88,13 +94,37 @@ impl Workspace {
         Ok(true)
     }
 
-    /// Impulses of inputs, and the diagonals of springs and dampers of coordinates.
-    fn fill_inputs(&mut self, at: StepContext<'_>, out: &mut Linearization) {
-        let (model, h) = (at.model, at.settings.time_step_s);
-        for (place, input) in out.inputs.iter_mut().zip(&model.coordinate_inputs) {
-            place.momentum = h * input.gain;
-            place.residual = out.at_start * place.momentum;
+    /// Linearizes in O(n²), for trees in space without constraints and prescribed coordinates.
+    fn linearize_space(
+        &mut self,
+        at: StepContext<'_>,
+        out: &mut Linearization,
+    ) -> Result<bool, StepError> {
+        let StepContext { model, settings, .. } = at;
+        self.mid.fill_diagonal(model, settings, &mut self.kkt.diagonal);
+        self.mid.mechanics.differentiate(model);
+        self.fill_diagonals(model, settings);
+        out.turnings.clear();
+        if model.orientations.is_empty() {
+            fill_inputs(at, out);
+        } else {
+            self.weigh_balls(model, settings);
+            self.find_turnings(at, out);
+            self.fill_turned_inputs(model, out);
         }
+        let Self { mid, kkt, constraints, tangents, .. } = self;
+        let constraints = [&constraints.start, &constraints.end];
+        let at = linearized(model, settings, &mut mid.mechanics, constraints);
+        let Tangents { diagonals, balls, .. } = &*tangents;
+        let own = Own { diagonals, turnings: &out.turnings, balls };
+        let (increment, momentum, stride) = (&mut out.increment, &mut out.momentum, out.stride);
+        let rows = Rows { increment, momentum, stride };
+        kkt.linearize_in_space(at, own, rows).map_err(|pivot| model.singular_matrix(pivot))
+    }
+
+    /// The diagonals of springs and dampers of coordinates.
+    fn fill_diagonals(&mut self, model: &Model, settings: &Settings) {
+        let h = settings.time_step_s;
         let [residual, slope] = &mut self.tangents.diagonals;
         if model.potentials.any {
             residual.fill(0.0);
@@ -125,7 +155,8 @@ impl Workspace {
             &self.step.multipliers,
             &mut self.tangents.constraint_hessian,
         );
-        self.fill_inputs(at, out);
+        fill_inputs(at, out);
+        self.fill_diagonals(model, settings);
         let tree = self.mid.mechanics.planar.as_deref().and_then(PlanarTree::many);
         let (Some(tree), Some(start), Some(end), Recursion::Loops(fronts)) = (
             tree,
@@ -191,10 +222,7 @@ impl Workspace {
                 add_momenta(out);
                 return;
             }
-            for (place, input) in out.inputs.iter_mut().zip(&model.coordinate_inputs) {
-                place.momentum = h * input.gain;
-                place.residual = out.at_start * place.momentum;
-            }
+            fill_inputs(at, out);
             self.tangents.end_slopes.fill(0.0);
             for pair in &model.pairs {
                 let (i, j) = (pair.row as usize, pair.column as usize);
@@ -396,6 +424,14 @@ impl Workspace {
             self.tangents.terms.extend(responses.map(|(c, r)| (-r, c)));
             add_rows(target, &out.multipliers, stride, &self.tangents.terms);
         }
+    }
+}
+
+/// Impulses of inputs of coordinates.
+fn fill_inputs(at: StepContext<'_>, out: &mut Linearization) {
+    for (place, input) in out.inputs.iter_mut().zip(&at.model.coordinate_inputs) {
+        place.momentum = at.settings.time_step_s * input.gain;
+        place.residual = out.at_start * place.momentum;
     }
 }
 

@@ -20,6 +20,7 @@ use plantd_math::spatial::{Mat3, three};
 
 use crate::integrator::balls::BallJoints;
 use crate::integrator::workspace::{StepContext, Tangents, Workspace};
+use crate::kkt::space::columns::OfBall;
 use crate::lagrangian::curvature::Within;
 use crate::lagrangian::generators::{Flanks, Parts};
 use crate::lagrangian::turning::Turning;
@@ -148,27 +149,47 @@ impl Sink<'_> {
         in_eights(PutPairs { pairs, flanks, increment, momentum, end_slopes, nd, stride });
     }
 
-    /// The same for the axes of one ball joint. The change of `m × ξ + (2a − 1) h (T⁻ − 1) f` with `ξ` is
+    /// The same for the axes of one ball joint.
+    fn put_ball(&mut self, first: usize, own: &OfBall) {
+        let Self { nd, stride, .. } = *self;
+        for (row, column) in (0..9).map(|entry| (entry / 3, entry % 3)) {
+            let (i, j) = (first + row, first + column);
+            self.increment[i * stride + j] = own.residual.0[column][row];
+            self.momentum[i * stride + j] = own.by_start.0[column][row];
+            self.tangents.end_slopes[i * nd + j] = own.by_increment.0[column][row];
+        }
+    }
+}
+
+impl OfBall {
+    /// What the Lagrangian of the bodies gives. The change of `m × ξ + (2a − 1) h (T⁻ − 1) f` with `ξ` is
     /// `turned`.
-    fn put_ball(&mut self, turning: &Turning, within: &Within, turned: &Mat3) {
-        let Self { h, nd, stride, .. } = *self;
+    fn new(turning: &Turning, within: &Within, turned: &Mat3, h: f64) -> Self {
         let Within { tau_z, tau_v, m_v } = within;
         let (start, middle) = (&turning.by_start.0, &turning.by_next.0);
         let spin = turning.spin();
         let [torque, momentum] = [tau_z.times(start), tau_v.transpose().times(start)];
         let residual = turning.torque.times(&torque.scaled(0.5 * h));
         let residual = residual.minus(&turning.momentum.times(&momentum));
-        let stiffness = torque.scaled(h).plus(&spin.times(&momentum));
+        let by_start = torque.scaled(h).plus(&spin.times(&momentum));
         let torque = tau_z.times(middle).plus(&tau_v.scaled(1.0 / h));
         let momentum = tau_v.transpose().times(middle).plus(&m_v.scaled(1.0 / h));
-        let slopes = torque.scaled(h).plus(&spin.times(&momentum)).plus(turned);
-        let first = turning.coordinate;
-        for (row, column) in (0..9).map(|entry| (entry / 3, entry % 3)) {
-            let (i, j) = (first + row, first + column);
-            self.increment[i * stride + j] = residual.0[column][row];
-            self.momentum[i * stride + j] = stiffness.0[column][row];
-            self.tangents.end_slopes[i * nd + j] = slopes.0[column][row];
-        }
+        let by_increment = torque.scaled(h).plus(&spin.times(&momentum)).plus(turned);
+        Self { residual, by_start, by_increment }
+    }
+
+    /// Dampers and armatures of its coordinates, which change with the velocity `ξ/h` alone.
+    fn add(
+        &mut self,
+        turning: &Turning,
+        axis: usize,
+        [damping, inertia]: [f64; 2],
+        [h, skew]: [f64; 2],
+    ) {
+        let [own, torque] = [Mat3::IDENTITY, turning.torque].map(|map| map.0[axis]);
+        let force = own * h + (torque - own) * skew;
+        let change = force * -damping + turning.spin().0[axis] * inertia;
+        self.by_increment.0[axis] += change * (1.0 / h);
     }
 }
 
@@ -225,10 +246,9 @@ impl Workspace {
         out: &mut Linearization,
     ) {
         let (model, h) = (at.model, at.settings.time_step_s);
+        self.find_turnings(at, out);
         let Self { mid, kkt, balls, tangents, .. } = self;
         let balls = &*balls;
-        let turns = model.orientations.iter().zip(&balls.turns);
-        out.turnings.extend(turns.map(|(&i, turn)| Turning::new(model, i, turn.xi, h)));
         tangents.find_flanks(model, &mid.mechanics.curvature, (&out.turnings, &kkt.balls), h);
         let split = h * out.at_start;
         let mut sink = Sink {
@@ -246,16 +266,10 @@ impl Workspace {
         };
         let joints = &model.dynamics.joints;
         sink.put_pairs(model);
-        for (first, joint) in joints.iter().enumerate() {
-            if joint.kind == JointKind::Ball(0) && joint.coordinate < sink.nd {
-                let i = joint.coordinate;
-                let turning = &sink.turnings[joint.orientation];
-                let forces = turning.turn.changes().of_torque(three(&mid.force, i));
-                let momentum = three(&mid.l_v, i);
-                let turned = rotation::crossed(-momentum);
-                let turned = turned.plus(&forces.scaled(sink.skew));
-                let within = mid.mechanics.curvature.within_ball(first);
-                sink.put_ball(turning, &within, &turned);
+        for (o, &first) in model.orientations.iter().enumerate() {
+            if first < sink.nd {
+                let own = sink.tangents.balls[o];
+                sink.put_ball(first, &own);
             }
         }
         for pair in &model.mixed_pairs {
@@ -275,10 +289,10 @@ impl Workspace {
                 }
             });
         }
-        for a in &model.armature {
+        for a in model.armature.iter().filter(|a| balls.of(a.row).is_none()) {
             sink.add(a.row, a.column, Entry { momentum: [0.0, a.inertia], ..Entry::default() });
         }
-        for (i, c) in model.damping.iter().enumerate() {
+        for (i, c) in model.damping.iter().enumerate().filter(|(i, _)| balls.of(*i).is_none()) {
             sink.add(i, i, Entry { force: [0.0, -c], ..Entry::default() });
         }
         if let Some(forces) = &model.forces {
@@ -291,8 +305,39 @@ impl Workspace {
         self.fill_turned_inputs(model, out);
     }
 
+    /// How ball joints turn, and what they have of themselves, at the second derivatives of the last Newton
+    /// matrix.
+    pub(crate) fn find_turnings(&mut self, at: StepContext<'_>, out: &mut Linearization) {
+        let (model, h, nd) = (at.model, at.settings.time_step_s, out.nd);
+        let skew = (2.0 * out.at_start - 1.0) * h;
+        let Self { mid, balls, tangents, .. } = self;
+        let turns = model.orientations.iter().zip(&balls.turns);
+        out.turnings.clear();
+        out.turnings.extend(turns.map(|(&i, turn)| Turning::new(model, i, turn.xi, h)));
+        for (first, joint) in model.dynamics.joints.iter().enumerate() {
+            let i = joint.coordinate;
+            if joint.kind != JointKind::Ball(0) || i >= nd {
+                continue;
+            }
+            let turning = &out.turnings[joint.orientation];
+            let forces = turning.turn.changes().of_torque(three(&mid.force, i));
+            let turned = rotation::crossed(-three(&mid.l_v, i)).plus(&forces.scaled(skew));
+            let within = mid.mechanics.curvature.within_ball(first);
+            let own = &mut tangents.balls[joint.orientation];
+            *own = OfBall::new(turning, &within, &turned, h);
+            for (axis, c) in model.damping.iter().skip(i).take(3).enumerate() {
+                own.add(turning, axis, [*c, 0.0], [h, skew]);
+            }
+        }
+        for a in &model.armature {
+            if let Some((o, axis)) = balls.of(a.row) {
+                tangents.balls[o].add(&out.turnings[o], axis, [0.0, a.inertia], [h, skew]);
+            }
+        }
+    }
+
     /// What unit inputs give, in the places of [`Model::input_pattern`].
-    fn fill_turned_inputs(&mut self, model: &Model, out: &mut Linearization) {
+    pub(crate) fn fill_turned_inputs(&mut self, model: &Model, out: &mut Linearization) {
         let (h, nd) = (out.time_step_s, out.nd);
         let (split, skew) = (h * out.at_start, (2.0 * out.at_start - 1.0) * h);
         let Linearization { inputs, turnings, .. } = out;
