@@ -186,15 +186,14 @@ impl Workspace {
 
     /// Guess: the velocity that belongs to the momentum goes on.
     pub(crate) fn ballistic(&mut self, model: &Model, settings: &Settings, state: &PreciseState) {
-        if self.coast(model, settings, state) {
-            return;
+        if !self.coast(model, settings, state) {
+            let is_singular = self.find_velocity(model, state) < settings.singular_below;
+            for (x, v) in self.step.increment.iter_mut().zip(&self.residual.dynamics) {
+                // A singular mass matrix has no velocity; the Newton matrix will name the coordinate.
+                *x = if v.is_finite() && !is_singular { settings.time_step_s * v } else { 0.0 };
+            }
+            self.step.multipliers.copy_from_slice(&state.multipliers);
         }
-        let is_singular = self.find_velocity(model, state) < settings.singular_below;
-        for (x, v) in self.step.increment.iter_mut().zip(&self.residual.dynamics) {
-            // A singular mass matrix has no velocity; the Newton matrix will name the coordinate.
-            *x = if v.is_finite() && !is_singular { settings.time_step_s * v } else { 0.0 };
-        }
-        self.step.multipliers.copy_from_slice(&state.multipliers);
         // The velocity was found with the prescribed velocities of the last step, not of this one.
         for i in model.dimensions.dynamic..self.mid.velocity.len() {
             self.mid.velocity[i] = (self.step.q_end[i] - state.q[i]) / settings.time_step_s;
@@ -223,7 +222,9 @@ impl Workspace {
         if !self.kkt.has_recursion() {
             return false;
         }
-        self.mid.velocity.fill(0.0);
+        let (dynamic, prescribed) = self.mid.velocity.split_at_mut(state.p.len());
+        dynamic.fill(0.0);
+        prescribed.copy_from_slice(&state.v);
         for (matrix, orientation) in self.balls.start.iter_mut().zip(&state.orientations) {
             *matrix = orientation.matrix();
         }
@@ -234,8 +235,9 @@ impl Workspace {
             return false;
         }
         let Residual { dynamics: x, constraints, .. } = &mut self.residual;
-        for (x, p) in x.iter_mut().zip(&state.p) {
-            *x = -p;
+        // `L_v` is the momentum that belongs to what is prescribed.
+        for ((x, p), l_v) in x.iter_mut().zip(&state.p).zip(&self.mid.l_v) {
+            *x = l_v - p;
         }
         constraints.fill(0.0);
         self.kkt.solve(model, &self.constraints.start, x, constraints);

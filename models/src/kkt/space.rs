@@ -48,12 +48,26 @@ pub(crate) struct Added<'a> {
     pub(crate) balls: &'a [Weights],
 }
 
-/// Axes one below the other that are eliminated at once: hinges, slides and screws, or those of a ball joint.
+/// Axes one below the other that are eliminated at once.
 #[derive(Clone, Debug)]
 struct Group {
     axes: Range<usize>,
-    /// The orientation of a ball joint.
-    ball: Option<usize>,
+    kind: GroupKind,
+    /// The coordinates of the axes.
+    rows: Range<usize>,
+    /// Dynamic and prescribed coordinates of the axes and of all that is below them.
+    reach: [Range<usize>; 2],
+}
+
+/// What axes are eliminated together.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum GroupKind {
+    /// Hinges, slides and screws.
+    Single,
+    /// Those of a ball joint, with its orientation.
+    Ball(usize),
+    /// One whose motion is prescribed: it is not eliminated, and what is below it passes on to its parent as it is.
+    Prescribed,
 }
 
 /// Groups one below the other, with nothing beside them.
@@ -64,8 +78,6 @@ struct Limb {
     /// Where the sums of the limbs are that hang from its lowest joint.
     carries: Option<usize>,
     hangs_from: Option<Fork>,
-    /// Behind the last axis of all that hangs from it.
-    end: usize,
 }
 
 /// Where limbs meet.
@@ -187,7 +199,7 @@ fn inverse<const W: usize>(d: &[[f64; W]; W]) -> ([[f64; W]; W], [f64; W]) {
 }
 
 /// Limbs and groups in the order of their elimination, and how many places of sums there are.
-fn limbs(tree: &Tree) -> (Vec<Limb>, Vec<Group>, usize) {
+fn limbs(tree: &Tree, nd: usize) -> (Vec<Limb>, Vec<Group>, usize) {
     let joints = &tree.joints[..];
     let mut children = vec![0; joints.len()];
     // Behind the last axis below each.
@@ -221,7 +233,16 @@ fn limbs(tree: &Tree) -> (Vec<Limb>, Vec<Group>, usize) {
         }
         let parent = joints[top].parent;
         let begin = groups.len();
-        gather(tree, top..end, &mut groups);
+        gather(tree, top..end, nd, &mut groups);
+        for group in &mut groups[begin..] {
+            let below = group.axes.start..ends[lowest];
+            let (mut dynamic, mut prescribed) = (nd..0, usize::MAX..0);
+            for i in joints[below].iter().map(|joint| joint.coordinate) {
+                let reach = if i < nd { &mut dynamic } else { &mut prescribed };
+                *reach = i.min(reach.start)..(i + 1).max(reach.end);
+            }
+            group.reach = [dynamic, prescribed];
+        }
         limbs.push(Limb {
             groups: begin..groups.len(),
             carries: (children[lowest] > 1).then_some(forks[lowest]),
@@ -229,7 +250,6 @@ fn limbs(tree: &Tree) -> (Vec<Limb>, Vec<Group>, usize) {
                 place: forks[parent],
                 is_first: !std::mem::replace(seen, true),
             }),
-            end: ends[lowest],
         });
         end = top;
     }
@@ -237,21 +257,33 @@ fn limbs(tree: &Tree) -> (Vec<Limb>, Vec<Group>, usize) {
 }
 
 /// Groups of axes one below the other, the lowest first; as few as can be, and of like sizes.
-fn gather(tree: &Tree, axes: Range<usize>, groups: &mut Vec<Group>) {
+fn gather(tree: &Tree, axes: Range<usize>, nd: usize, groups: &mut Vec<Group>) {
+    let kind = |i: usize| match &tree.joints[i] {
+        joint if joint.coordinate >= nd => GroupKind::Prescribed,
+        joint => match joint.kind {
+            JointKind::Ball(_) => GroupKind::Ball(joint.orientation),
+            _ => GroupKind::Single,
+        },
+    };
+    let mut push = |axes: Range<usize>, kind| {
+        let first = tree.joints[axes.start].coordinate;
+        let rows = first..first + axes.len();
+        groups.push(Group { axes, kind, rows, reach: [0..0, 0..0] });
+    };
     let mut end = axes.end;
     while end > axes.start {
-        if let JointKind::Ball(axis) = tree.joints[end - 1].kind {
-            let start = end - 1 - axis;
-            let ball = Some(tree.joints[start].orientation);
-            groups.push(Group { axes: start..end, ball });
-            end = start;
-            continue;
-        }
-        let is_ball = |i: &usize| matches!(tree.joints[*i].kind, JointKind::Ball(_));
-        let start = (axes.start..end).rev().find(is_ball).map_or(axes.start, |i| i + 1);
+        let own = kind(end - 1);
+        let start = match own {
+            GroupKind::Ball(_) => end - 3,
+            GroupKind::Prescribed => end - 1,
+            GroupKind::Single => {
+                let others = (axes.start..end).rev().find(|i| kind(*i) != own);
+                others.map_or(axes.start, |i| i + 1)
+            }
+        };
         for left in (1..=(end - start).div_ceil(WIDEST)).rev() {
             let width = (end - start).div_ceil(left);
-            groups.push(Group { axes: end - width..end, ball: None });
+            push(end - width..end, own);
             end -= width;
         }
     }
@@ -260,7 +292,7 @@ fn gather(tree: &Tree, axes: Range<usize>, groups: &mut Vec<Group>) {
 impl SpatialRecursion {
     pub(crate) fn new(model: &Model) -> Self {
         let joints = model.dynamics.joints.len();
-        let (limbs, groups, places) = limbs(&model.dynamics);
+        let (limbs, groups, places) = limbs(&model.dynamics, model.dimensions.dynamic);
         Self {
             within: vec![[[0.0; WIDEST]; WIDEST]; groups.len()],
             limbs,
@@ -271,8 +303,8 @@ impl SpatialRecursion {
         }
     }
 
-    /// Factors the matrix that belongs to the last second derivatives; all joints are dynamic,
-    /// in the order of their coordinates. Each pivot is compared with the larger of its diagonal entry
+    /// Factors the matrix that belongs to the last second derivatives; dynamic joints are in the order of their
+    /// coordinates. Each pivot is compared with the larger of its diagonal entry
     /// and the inertia of its row over the step. Of masses alone it is `−M/h`. About 600 flops an axis.
     #[inline(never)]
     pub(crate) fn factor(
@@ -333,19 +365,23 @@ impl SpatialRecursion {
         for (group, within) in self.groups.iter().zip(&mut self.within) {
             let (range, first) = (group.axes.clone(), group.axes.start);
             let axes = &mut self.axes[range.clone()];
-            if let Some(ball) = group.ball {
-                let parts = step.parts_of_ball::<E>(curvature, first);
-                let (generators, own) = of_ball(&parts, &added.balls[ball]);
-                for (axis, own) in axes.iter_mut().zip(generators) {
-                    own.put(axis);
+            match group.kind {
+                GroupKind::Single => {}
+                GroupKind::Ball(ball) => {
+                    let parts = step.parts_of_ball::<E>(curvature, first);
+                    let (generators, own) = of_ball(&parts, &added.balls[ball]);
+                    for (axis, own) in axes.iter_mut().zip(generators) {
+                        own.put(axis);
+                    }
+                    *within = own;
+                    continue;
                 }
-                *within = own;
-                continue;
+                GroupKind::Prescribed => continue,
             }
-            for (i, axis) in range.clone().zip(&mut *axes) {
+            for (i, axis) in range.zip(&mut *axes) {
                 step.parts::<E>(curvature, i).generators().put(axis);
             }
-            let diagonal = &added.diagonal[range];
+            let diagonal = &added.diagonal[group.rows.clone()];
             match *axes {
                 [ref a] => write_within::<E, 1>([a], diagonal, within),
                 [ref a, ref b] => write_within::<E, 2>([a, b], diagonal, within),
@@ -371,13 +407,16 @@ impl SpatialRecursion {
             let mut carries = limb.carries.is_some();
             for at in limb.groups.clone() {
                 let (group, within) = (&self.groups[at], &mut self.within[at]);
-                let first = group.axes.start;
+                let first = group.rows.start;
                 let see = |axis: usize, pivot: f64, entry: f64| {
                     smallest.see(first + axis, pivot, entry.abs().max(inertia(first + axis)));
                 };
                 let is_root = limb.hangs_from.is_none() && at + 1 == limb.groups.end;
                 let axes = &self.axes[group.axes.clone()];
                 watch.see(at, group, axes, carries.then_some(&sums));
+                if group.kind == GroupKind::Prescribed {
+                    continue;
+                }
                 let sums = &mut sums;
                 match &mut self.axes[group.axes.clone()] {
                     [a] => eliminate([a], within, sums, carries, is_root, see),
@@ -487,9 +526,12 @@ impl InEights for Solve<'_> {
                 None => E::all(0.0),
             };
             for at in limb.groups.clone() {
-                let range = groups[at].axes.clone();
-                let (axes, x, inverse) = (&axes[range.clone()], &mut x[range], &within[at]);
-                flow = match (axes, x) {
+                let Group { axes: range, rows, kind, .. } = &groups[at];
+                if *kind == GroupKind::Prescribed {
+                    continue;
+                }
+                let inverse = &within[at];
+                flow = match (&axes[range.clone()], &mut x[rows.clone()]) {
                     ([a], [x]) => lift([a], [x], inverse, flow),
                     ([a, b], [x, y]) => lift([a, b], [x, y], inverse, flow),
                     ([a, b, c], [x, y, z]) => lift([a, b, c], [x, y, z], inverse, flow),
@@ -508,8 +550,11 @@ impl InEights for Solve<'_> {
                 None => E::all(0.0),
             };
             for at in limb.groups.clone().rev() {
-                let range = groups[at].axes.clone();
-                flow = match (&axes[range.clone()], &mut x[range]) {
+                let Group { axes: range, rows, kind, .. } = &groups[at];
+                if *kind == GroupKind::Prescribed {
+                    continue;
+                }
+                flow = match (&axes[range.clone()], &mut x[rows.clone()]) {
                     ([a], [x]) => lower([a], [x], flow),
                     ([a, b], [x, y]) => lower([a, b], [x, y], flow),
                     ([a, b, c], [x, y, z]) => lower([a, b, c], [x, y, z], flow),

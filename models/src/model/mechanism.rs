@@ -10,7 +10,7 @@ use crate::model::held::Held;
 use crate::model::loop_plan::Loops;
 use crate::model::planar_tree::{PlanarJoint, PlanarJoints};
 use crate::model::signal::{Signal, Target};
-use crate::model::tree::{Attachment, Tree};
+use crate::model::tree::{Attachment, Joint, JointKind, Tree};
 
 /// A compiled scene: immutable, shared by all plants made from it.
 #[derive(Debug)]
@@ -109,13 +109,19 @@ impl Solver {
         needs_poses: bool,
         d: Dimensions,
     ) -> Self {
-        let joints = tree.joints.iter().map(|joint| joint.coordinate);
-        if d.constraints > 0 || d.prescribed > 0 || !joints.eq(0..d.dynamic) {
+        let is_prescribed = |joint: &&Joint| joint.coordinate >= d.dynamic;
+        let prescribed = tree.joints.iter().filter(is_prescribed);
+        let dynamic = tree.joints.iter().filter(|joint| !is_prescribed(joint));
+        let in_order = dynamic.chain(prescribed.clone()).map(|joint| joint.coordinate);
+        if d.constraints > 0 || !in_order.eq(0..d.coordinates()) {
             return Self::Tree;
         }
         if planar.is_some() {
-            return if d.dynamic >= Self::MANY { Self::Planar } else { Self::Tree };
+            let by_generators = d.prescribed == 0 && d.dynamic >= Self::MANY;
+            return if by_generators { Self::Planar } else { Self::Tree };
         }
+        let needs_poses =
+            needs_poses || prescribed.clone().any(|joint| matches!(joint.kind, JointKind::Ball(_)));
         if !needs_poses && elimination.entries() > Self::DEEP * d.dynamic {
             Self::Spatial
         } else {

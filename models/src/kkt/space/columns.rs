@@ -21,13 +21,15 @@
 //! with `G = own + minus · A above`. A row costs 24 products and sums for a column, and 24 more if it is above the
 //! joint of the column.
 
+use std::ops::Range;
+
 use plantd_math::eights::{Eight, InEights, in_eights};
 use plantd_math::rows::{Block, LANES};
 use plantd_math::spatial::Mat3;
 use plantd_math::tree_lu::SmallestPivot;
 
 use crate::kkt::space::{
-    Added, Fork, Group, Limb, SpatialRecursion, Sums, WIDEST, Watch, combined,
+    Added, Fork, Group, GroupKind, Limb, SpatialRecursion, Sums, WIDEST, Watch, combined,
 };
 use crate::lagrangian::curvature::Curvature;
 use crate::lagrangian::generators::{Flanks, Generators, Step};
@@ -36,7 +38,8 @@ use crate::lagrangian::turning::Turning;
 /// A matrix of the axes of a group, by rows.
 type Square = [[f64; WIDEST]; WIDEST];
 
-/// What an axis gives to the derivatives of a step beside its generators.
+/// What an axis gives to the derivatives of a step beside its generators. Of an axis whose motion is prescribed, and
+/// which has no rows, `carry` and `push` are what `above` and `below` are, by its next position.
 #[derive(Clone, Copy, Debug, Default)]
 struct Margin {
     carry: Block,
@@ -158,8 +161,12 @@ impl Columns {
     fn go_up<E: Eight>(&mut self, recursion: &SpatialRecursion, first: usize) {
         let SpatialRecursion { limbs, groups, axes, within, .. } = recursion;
         let n = axes.len();
-        let has = |from: usize, end: usize| from < first + LANES && first < end;
-        for Limb { groups: own, carries, hangs_from, end } in limbs {
+        let has = |reach: &Range<usize>, more: usize| {
+            reach.start < reach.end
+                && reach.start + more < first + LANES
+                && first < reach.end + more
+        };
+        for Limb { groups: own, carries, hangs_from } in limbs {
             let mut flow = [E::ZERO; 8];
             if let Some(place) = *carries {
                 flow = of_blocks(&self.flows[place]);
@@ -167,9 +174,18 @@ impl Columns {
             }
             let mut any = false;
             for at in own.clone() {
-                let range = groups[at].axes.clone();
-                let start = range.start;
-                any = has(start, *end) || has(n + start, n + end);
+                let Group { axes: range, rows, kind, reach } = &groups[at];
+                any = any || reach.iter().any(|reach| has(reach, 0) || has(reach, n));
+                let (start, margins) = (rows.start, &self.margins[range.clone()]);
+                if *kind == GroupKind::Prescribed {
+                    if let Some(unit) = unit::<E>(start, first) {
+                        add(&mut flow, &margins[0].below, unit);
+                    }
+                    if let Some(unit) = unit::<E>(n + start, first) {
+                        add(&mut flow, &margins[0].push, unit);
+                    }
+                    continue;
+                }
                 let increment = &mut self.increment[range.clone()];
                 let momentum = &mut self.momentum[range.clone()];
                 if !any {
@@ -178,7 +194,7 @@ impl Columns {
                     continue;
                 }
                 let group = Lifted {
-                    margins: &self.margins[range.clone()],
+                    margins,
                     among: &self.among[at],
                     inverse: &within[at],
                     increment,
@@ -186,7 +202,7 @@ impl Columns {
                     columns: [start, n + start],
                     first,
                 };
-                match &axes[range] {
+                match &axes[range.clone()] {
                     [a] => group.lift([a], &mut flow),
                     [a, b] => group.lift([a, b], &mut flow),
                     [a, b, c] => group.lift([a, b, c], &mut flow),
@@ -210,22 +226,33 @@ impl Columns {
         rows: &mut Rows<'_>,
     ) {
         let SpatialRecursion { limbs, groups, axes, .. } = recursion;
+        let n = axes.len();
         for Limb { groups: own, carries, hangs_from, .. } in limbs.iter().rev() {
             let mut motion = match hangs_from {
                 Some(fork) => of_blocks(&self.motions[fork.place]),
                 None => [E::ZERO; 8],
             };
             for at in own.clone().rev() {
-                let range = groups[at].axes.clone();
+                let Group { axes: range, rows: own, kind, .. } = &groups[at];
+                let (start, margins) = (own.start, &self.margins[range.clone()]);
+                if *kind == GroupKind::Prescribed {
+                    if let Some(unit) = unit::<E>(start, first) {
+                        add(&mut motion, &margins[0].above, unit);
+                    }
+                    if let Some(unit) = unit::<E>(n + start, first) {
+                        add(&mut motion, &margins[0].carry, unit);
+                    }
+                    continue;
+                }
                 let group = Lowered {
-                    margins: &self.margins[range.clone()],
+                    margins,
                     among: &self.among[at],
                     increment: &self.increment[range.clone()],
                     momentum: &self.momentum[range.clone()],
-                    start: range.start,
+                    start,
                     first,
                 };
-                match &axes[range] {
+                match &axes[range.clone()] {
                     [a] => group.lower([a], &mut motion, rows),
                     [a, b] => group.lower([a, b], &mut motion, rows),
                     [a, b, c] => group.lower([a, b, c], &mut motion, rows),
@@ -294,7 +321,7 @@ struct Lowered<'a> {
     among: &'a Among,
     increment: &'a [Block],
     momentum: &'a [Block],
-    /// Its first axis.
+    /// Its first row.
     start: usize,
     first: usize,
 }
@@ -344,22 +371,29 @@ impl<E: Eight> Watch<E> for Keep<'_> {
         let first = group.axes.start;
         let margins = &mut columns.margins[group.axes.clone()];
         let among = &mut columns.among[at];
-        if let Some(ball) = group.ball {
-            let parts = step.parts_of_ball::<E>(curvature, first);
-            let flanks = Flanks::of_ball(&parts, &own.turnings[ball], &added.balls[ball]);
-            for (flanks, margin) in flanks.iter().zip(&mut *margins) {
-                margin.take(flanks);
+        match group.kind {
+            GroupKind::Single => {}
+            GroupKind::Ball(ball) => {
+                let parts = step.parts_of_ball::<E>(curvature, first);
+                let flanks = Flanks::of_ball(&parts, &own.turnings[ball], &added.balls[ball]);
+                for (flanks, margin) in flanks.iter().zip(&mut *margins) {
+                    margin.take(flanks);
+                }
+                among.take(&own.balls[ball]);
+                if let ([a, b, c], Some(sums)) = (axes, sums) {
+                    include([a, b, c], margins, among, sums);
+                }
+                return;
             }
-            among.take(&own.balls[ball]);
-            if let ([a, b, c], Some(sums)) = (axes, sums) {
-                include([a, b, c], margins, among, sums);
+            GroupKind::Prescribed => {
+                margins[0].take_prescribed(&step.parts::<E>(curvature, first).generators(), sums);
+                return;
             }
-            return;
         }
         for (i, margin) in group.axes.clone().zip(&mut *margins) {
             margin.take(&Flanks::of(&step.parts::<E>(curvature, i)));
         }
-        let diagonals = [0, 1].map(|k: usize| &own.diagonals[k][group.axes.clone()]);
+        let diagonals = [0, 1].map(|k: usize| &own.diagonals[k][group.rows.clone()]);
         match axes {
             [a] => write_among([a], margins, diagonals, among, sums),
             [a, b] => write_among([a, b], margins, diagonals, among, sums),
@@ -376,6 +410,21 @@ impl Margin {
         flanks.push.put(&mut self.push);
         flanks.above.put(&mut self.above);
         flanks.below.put(&mut self.below);
+    }
+
+    /// An end that moves takes the midpoint half as far, and the velocity by `∓1/h`.
+    #[inline(always)]
+    fn take_prescribed<E: Eight>(&mut self, own: &Generators<E>, sums: Option<&Sums<E>>) {
+        let Self { carry, push, above, below } = self;
+        own.minus.put(above);
+        own.lower.put(below);
+        own.plus.put(carry);
+        own.upper.put(push);
+        if let Some(sums) = sums {
+            for (above, below) in [(above, below), (carry, push)] {
+                E::of(below).plus(combined(&sums.columns, above)).put(below);
+            }
+        }
     }
 }
 
