@@ -235,13 +235,12 @@ fn limbs(tree: &Tree, nd: usize) -> (Vec<Limb>, Vec<Group>, usize) {
         let begin = groups.len();
         gather(tree, top..end, nd, &mut groups);
         for group in &mut groups[begin..] {
-            let below = group.axes.start..ends[lowest];
-            let (mut dynamic, mut prescribed) = (nd..0, usize::MAX..0);
-            for i in joints[below].iter().map(|joint| joint.coordinate) {
-                let reach = if i < nd { &mut dynamic } else { &mut prescribed };
-                *reach = i.min(reach.start)..(i + 1).max(reach.end);
+            // In the order of their coordinates, both.
+            for joint in &joints[group.axes.start..ends[lowest]] {
+                let i = joint.coordinate;
+                let reach = &mut group.reach[usize::from(i >= nd)];
+                *reach = if reach.end == 0 { i..i + 1 } else { reach.start..i + 1 };
             }
-            group.reach = [dynamic, prescribed];
         }
         limbs.push(Limb {
             groups: begin..groups.len(),

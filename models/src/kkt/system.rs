@@ -36,8 +36,8 @@ pub(crate) struct KktSystem {
     /// How ball joints weigh their rows and columns.
     pub(crate) balls: Vec<Weights>,
     pub(crate) estimates: Estimates,
-    /// For a linearization by generators in space.
-    columns: Option<Box<Columns>>,
+    /// For linearizations by generators in space.
+    pub(crate) in_space: Option<Box<InSpace>>,
 }
 
 /// Factors of `K`.
@@ -63,6 +63,13 @@ pub(crate) enum Recursion {
     Held(Box<HeldLimbs>),
 }
 
+/// A linearization by generators in space, whatever steps are solved by.
+#[derive(Clone, Debug)]
+pub(crate) struct InSpace {
+    recursion: SpatialRecursion,
+    columns: Columns,
+}
+
 /// Which factors are valid.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) enum Factors {
@@ -70,6 +77,8 @@ pub(crate) enum Factors {
     #[default]
     Tree,
     Recursion,
+    /// None at the last evaluation: a linearization had its own.
+    Stale,
 }
 
 /// Reciprocal condition estimates of the last factorization.
@@ -116,14 +125,13 @@ impl KktSystem {
     /// Room for the factors, by what suits the model; columns of the Schur complement are `stride` apart.
     pub(crate) fn new(model: &Model, stride: usize) -> Self {
         let nd = model.dimensions.dynamic;
-        let factored = Factored::new(model);
-        let columns = match &factored.recursion {
-            Recursion::Spatial(recursion) => Some(Box::new(recursion.columns())),
-            _ => None,
-        };
+        let in_space = model.is_generated_in_space().then(|| {
+            let recursion = SpatialRecursion::new(model);
+            Box::new(InSpace { columns: recursion.columns(), recursion })
+        });
         Self {
-            factored,
-            columns,
+            factored: Factored::new(model),
+            in_space,
             schur: SchurComplement::new(model, stride),
             diagonal: vec![0.0; nd],
             balls: vec![Weights::REST; model.orientations.len()],
@@ -218,13 +226,14 @@ impl KktSystem {
         own: Own<'_>,
         rows: Rows<'_>,
     ) -> Result<bool, SmallestPivot> {
-        let Recursion::Spatial(recursion) = &mut self.factored.recursion else { return Ok(false) };
+        let Some(InSpace { recursion, columns }) = self.in_space.as_deref_mut() else {
+            return Ok(false);
+        };
         let Linearized { model, mechanics, time_step_s, singular_below, .. } = at;
         let added = Added { diagonal: &self.diagonal, balls: &self.balls };
         let step = (&model.conditioning.inertia[..], Step::new(time_step_s, MatrixKind::Newton));
-        self.factored.valid = Factors::Recursion;
+        self.factored.valid = Factors::Stale;
         let curvature = &mechanics.curvature;
-        let columns = self.columns.get_or_insert_with(|| Box::new(recursion.columns()));
         let pivot = recursion.linearize(columns, curvature, (added, own), step, rows);
         self.judge(pivot, singular_below).map(|()| true)
     }

@@ -34,8 +34,7 @@ impl Workspace {
             Recursion::Planar(_) => self.linearize_planar(at, out)?,
             Recursion::Loops(_) => self.linearize_loops(at, out)?,
             Recursion::Held(_) => self.linearize_held(at, out)?,
-            Recursion::Spatial(_) => self.linearize_space(at, out)?,
-            Recursion::None => false,
+            Recursion::None | Recursion::Spatial(_) => self.linearize_space(at, out)?,
         };
         if is_done {
             out.solved.remember(self, at);
@@ -94,13 +93,16 @@ impl Workspace {
         Ok(true)
     }
 
-    /// Linearizes in O(n²), for trees in space without constraints and prescribed coordinates.
+    /// Linearizes in O(n²), for trees in space without constraints, springs between points, and forces.
     fn linearize_space(
         &mut self,
         at: StepContext<'_>,
         out: &mut Linearization,
     ) -> Result<bool, StepError> {
         let StepContext { model, settings, .. } = at;
+        if self.kkt.in_space.is_none() {
+            return Ok(false);
+        }
         self.mid.fill_diagonal(model, settings, &mut self.kkt.diagonal);
         self.mid.mechanics.differentiate(model);
         self.fill_diagonals(model, settings);

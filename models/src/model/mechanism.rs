@@ -8,7 +8,7 @@ use plantd_scene::{CoordinateKind, Problem, Scene};
 use crate::model::conditioning::Conditioning;
 use crate::model::held::Held;
 use crate::model::loop_plan::Loops;
-use crate::model::planar_tree::{PlanarJoint, PlanarJoints};
+use crate::model::planar_tree::PlanarJoints;
 use crate::model::signal::{Signal, Target};
 use crate::model::tree::{Attachment, Joint, JointKind, Tree};
 
@@ -101,29 +101,21 @@ impl Solver {
     /// that are solved entry by entry can go side by side.
     const DEEP: usize = 6;
 
-    /// The fastest one for a scene; `needs_poses` where springs between points or forces act.
-    pub(crate) fn of(
-        tree: &Tree,
-        elimination: &SymbolicElimination,
-        planar: Option<&[PlanarJoint]>,
-        needs_poses: bool,
-        d: Dimensions,
-    ) -> Self {
-        let is_prescribed = |joint: &&Joint| joint.coordinate >= d.dynamic;
-        let prescribed = tree.joints.iter().filter(is_prescribed);
-        let dynamic = tree.joints.iter().filter(|joint| !is_prescribed(joint));
-        let in_order = dynamic.chain(prescribed.clone()).map(|joint| joint.coordinate);
-        if d.constraints > 0 || !in_order.eq(0..d.coordinates()) {
-            return Self::Tree;
+    /// Whether generators are faster in space.
+    pub(crate) fn is_deep(elimination: &SymbolicElimination) -> bool {
+        elimination.entries() > Self::DEEP * elimination.rows()
+    }
+
+    /// The fastest one for a model without loops and limbs that are held.
+    pub(crate) fn of(model: &Model) -> Self {
+        let d = model.dimensions;
+        if model.is_generated_in_space() {
+            return if Self::is_deep(&model.elimination) { Self::Spatial } else { Self::Tree };
         }
-        if planar.is_some() {
-            let by_generators = d.prescribed == 0 && d.dynamic >= Self::MANY;
-            return if by_generators { Self::Planar } else { Self::Tree };
-        }
-        let needs_poses =
-            needs_poses || prescribed.clone().any(|joint| matches!(joint.kind, JointKind::Ball(_)));
-        if !needs_poses && elimination.entries() > Self::DEEP * d.dynamic {
-            Self::Spatial
+        let coordinates = model.dynamics.joints.iter().map(|joint| joint.coordinate);
+        let is_free = d.constraints == 0 && coordinates.eq(0..d.dynamic);
+        if model.planar.is_some() && is_free && d.dynamic >= Self::MANY {
+            Self::Planar
         } else {
             Self::Tree
         }
@@ -613,6 +605,22 @@ pub struct OperatingPoint {
 }
 
 impl Model {
+    /// Whether vectors of the joints generate the whole Newton matrix in space: without constraints, springs between
+    /// points, forces, and ball joints that are moved.
+    pub(crate) fn is_generated_in_space(&self) -> bool {
+        let (d, joints) = (self.dimensions, &self.dynamics.joints[..]);
+        let is_moved = |joint: &&Joint| joint.coordinate >= d.dynamic;
+        let free = joints.iter().filter(|joint| !is_moved(joint));
+        let mut moved = joints.iter().filter(is_moved);
+        let in_order = free.chain(moved.clone()).map(|joint| joint.coordinate);
+        self.planar.is_none()
+            && d.constraints == 0
+            && self.forces.is_none()
+            && !self.potentials.couple_branches
+            && in_order.eq(0..d.coordinates())
+            && !moved.any(|joint| matches!(joint.kind, JointKind::Ball(_)))
+    }
+
     /// The scene it was compiled from.
     pub fn scene(&self) -> &Scene {
         &self.scene

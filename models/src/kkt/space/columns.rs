@@ -342,8 +342,8 @@ impl Lowered<'_> {
         }
         for a in 0..W {
             let at = (start + a) * rows.stride + first;
-            for b in 0..W {
-                p[a] = p[a].plus(x[b].scaled(among.by_increment[a][b]));
+            for (x, slope) in x.iter().zip(&among.by_increment[a]) {
+                p[a] = p[a].plus(x.scaled(*slope));
             }
             x[a].put_list(&mut rows.increment[at..][..LANES]);
             p[a].put_list(&mut rows.momentum[at..][..LANES]);

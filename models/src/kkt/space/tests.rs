@@ -178,6 +178,7 @@ fn both(model: &Arc<Model>, order: u32) -> [Plant; 2] {
     fast.initialize(&Initial::Velocity { q, v }).unwrap();
     let mut slow = fast.clone();
     slow.workspace.kkt.factored.recursion = Recursion::None;
+    slow.workspace.kkt.in_space = None;
     [fast, slow]
 }
 
@@ -390,6 +391,12 @@ fn generators_are_chosen_where_they_stand_for_the_matrix() {
     assert_eq!(solver(ball), Solver::Spatial);
     let prescribed = "[[coordinates]]\nname = \"f0\"\nkind = \"prescribed\"\n";
     assert_eq!(solver(prescribed), Solver::Spatial);
+    // A chain in a plane, but for what moves it.
+    let mut chain = builtin::scene("chain-32").unwrap();
+    assert_eq!(Model::compile(&chain).unwrap().solver, Solver::Planar);
+    chain.inputs.clear();
+    chain.coordinates[0].kind = CoordinateKind::Prescribed;
+    assert_eq!(Model::compile(&chain).unwrap().solver, Solver::Spatial);
     assert_eq!(solver(between), Solver::Tree);
     for bushy in ["tree-30", "marionette", "spherical-pendulum"] {
         let model = Model::compile(&builtin::scene(bushy).unwrap()).unwrap();
