@@ -6,7 +6,7 @@
 //! with A and B of all torques, column by column in memory of the driver's), the same with `-rough` (with new
 //! torques at each step) or with `-moving` (without the first step of a pass, which
 //! finds the velocity that a momentum means), `order-4` to `order-12` (Gauss collocation), `order-4-fast`
-//! and so on (solved to what precision `fast` asks for), and `scalar`: the midpoint rule written by hand
+//! and so on, `order-4-coarse` (solved to what the precisions `fast` and `coarse` ask for), and `scalar`: the midpoint rule written by hand
 //! for a pendulum.
 
 use std::collections::BTreeMap;
@@ -106,9 +106,10 @@ fn run(
     steps: u64,
     passes: u64,
 ) -> Result<(f64, Vec<f64>), Box<dyn Error>> {
-    let (method, precision) = match method.strip_suffix("-fast") {
-        Some(method) => (method, Precision::Fast),
-        None => (method, Precision::Exact),
+    let (method, precision) = match method.rsplit_once('-') {
+        Some((method, "fast")) => (method, Precision::Fast),
+        Some((method, "coarse")) => (method, Precision::Coarse),
+        _ => (method, Precision::Exact),
     };
     let (method, order) = match method.strip_prefix("order-") {
         Some(order) => ("midpoint", order.parse()?),

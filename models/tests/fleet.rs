@@ -129,7 +129,7 @@ fn in_every_way_to_step() {
             let settings = Settings { time_step_s: 0.002, ..settings };
             compare(&model, settings, 5, 1.0, name);
         }
-        for precision in [Precision::Exact, Precision::Fast] {
+        for precision in [Precision::Exact, Precision::Fast, Precision::Coarse] {
             for force_split in [ForceSplit::Symmetric, ForceSplit::Paper] {
                 let settings = Settings { precision, force_split, ..usual(&model) };
                 compare(&model, settings, 9, 1.0, name);

@@ -97,7 +97,7 @@ fn random_mechanisms_go_on_bit_for_bit() {
             if order > 2 && !(seed + w as u64).is_multiple_of(4) {
                 continue;
             }
-            for precision in [Precision::Exact, Precision::Fast] {
+            for precision in [Precision::Exact, Precision::Fast, Precision::Coarse] {
                 let time_step_s = [1e-3, 5e-3][seed as usize / 2 % 2];
                 let settings = Settings { order, substeps, precision, time_step_s, ..usual };
                 if let Some(mut plant) = starts(&scene, settings) {
@@ -118,7 +118,7 @@ fn built_in_scenes_go_on_bit_for_bit() {
             if name == "marionette" && (settings.order, settings.substeps) != (2, 1) {
                 continue;
             }
-            for precision in [Precision::Exact, Precision::Fast] {
+            for precision in [Precision::Exact, Precision::Fast, Precision::Coarse] {
                 for time_step_s in [settings.time_step_s, 0.1 * settings.time_step_s] {
                     let settings = Settings { precision, time_step_s, ..settings };
                     let mut plant = starts(&scene, settings).unwrap();

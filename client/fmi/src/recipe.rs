@@ -22,6 +22,9 @@ pub(crate) struct Recipe {
     /// Stop the solver at eleven digits.
     #[serde(default)]
     fast: bool,
+    /// Stop it at seven digits.
+    #[serde(default)]
+    coarse: bool,
     /// All forces at the start of a step, as in the paper.
     #[serde(default)]
     paper: bool,
@@ -39,7 +42,11 @@ impl Recipe {
             order: self.order.unwrap_or(usual.order),
             substeps: self.substeps.unwrap_or(usual.substeps),
             halvings: self.halvings.unwrap_or(usual.halvings),
-            precision: if self.fast { Precision::Fast } else { Precision::Exact },
+            precision: match self {
+                Self { coarse: true, .. } => Precision::Coarse,
+                Self { fast: true, .. } => Precision::Fast,
+                _ => Precision::Exact,
+            },
             force_split: if self.paper { ForceSplit::Paper } else { ForceSplit::Symmetric },
             max_iterations: self.max_iterations.unwrap_or(usual.max_iterations),
             singular_below: self.singular_below.unwrap_or(usual.singular_below),

@@ -135,6 +135,7 @@ def test_methods(client):
     assert (driver.report.steps, driver.report.halvings) == (2, 0)
     here = client.linearize("cart-pole", state=plant.state, u=[0.5], **method)
     assert here.next.x.tobytes() == state.x.tobytes()
+    assert client.create_plant("cart-pole", precision="coarse").precision == "coarse"
     chosen = client.create_plant("cart-pole", tolerance=1e-6)
     assert chosen.accuracy.error <= chosen.accuracy.tolerance == 1e-6
     assert (chosen.order, chosen.substeps) != (2, 1)

@@ -120,7 +120,7 @@ CALLS = [
     (lambda c: c.create_plant("pendulum", substeps=257), "substeps"),
     (lambda c: c.create_plant("pendulum", substeps=-1), "`substeps` is -1; a whole number from 0"),
     (lambda c: c.create_plant("pendulum", halvings=9), "halvings"),
-    (lambda c: c.create_plant("pendulum", precision="quick"), "`precision` is 'quick'; allowed are `exact`, `fast`"),
+    (lambda c: c.create_plant("pendulum", precision="quick"), "`precision` is 'quick'; allowed are `exact`, `fast`, `coarse`"),
     (lambda c: c.create_plant("pendulum", singular_below=2.0), "singular_below"),
     (lambda c: c.create_plant("pendulum", tolerance=1e-6, order=4), "order: is chosen by `tolerance`"),
     (lambda c: c.create_plant("pendulum", tolerance="small"), "`tolerance` is 'small'; a number"),

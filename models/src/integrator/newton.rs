@@ -20,6 +20,7 @@ use crate::model::mechanism::Model;
 pub(crate) const CONVERGED: f64 = 4.0;
 /// A residual this small will do where precision is not asked for.
 const NEARLY: f64 = 1e5;
+const ROUGHLY: f64 = 1e9;
 /// A residual that no longer falls, with a fresh Jacobian, is at its floor if it is below this.
 pub(crate) const FLOOR: f64 = 1e4;
 /// [`FLOOR`] for a Jacobian that was kept.
@@ -33,6 +34,7 @@ impl Precision {
         match self {
             Self::Exact => CONVERGED,
             Self::Fast => NEARLY,
+            Self::Coarse => ROUGHLY,
         }
     }
 }

@@ -58,6 +58,8 @@ pub enum Precision {
     /// At about eleven digits of the increment, which saves an evaluation or so; what conservation laws
     /// hold then drifts with time.
     Fast,
+    /// At about seven digits: for errors of 1e-6 and more, by long steps of high order.
+    Coarse,
 }
 
 /// How the force impulse of a step is split into `F⁻` and `F⁺`.

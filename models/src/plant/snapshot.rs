@@ -98,6 +98,7 @@ impl Snapshot {
         bytes.push(match self.settings.precision {
             Precision::Exact => 0,
             Precision::Fast => 1,
+            Precision::Coarse => 2,
         });
         bytes.push(match self.settings.force_split {
             ForceSplit::Symmetric => 0,
@@ -143,6 +144,7 @@ impl Snapshot {
             precision: match take::<1>(rest)? {
                 [0] => Precision::Exact,
                 [1] => Precision::Fast,
+                [2] => Precision::Coarse,
                 _ => return Err(malformed("unknown precision")),
             },
             force_split: match take::<1>(rest)? {

@@ -280,7 +280,7 @@ class PlantHandle:
             "order": plant.order,
             "substeps": plant.substeps,
             "halvings": plant.halvings,
-            "precision": "fast" if plant.precision == "fast" else "exact",
+            "precision": plant.precision,
             "singular_below": plant.singular_below,
             "newton_iterations": plant.newton_iterations,
         }

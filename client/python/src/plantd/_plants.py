@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +20,7 @@ from ._feedback import Feedback
 from ._gains import Gain
 from ._linearize import Linearization
 from ._realtime import StepTiming
-from ._requests import Stepping, initial_state, settings, trajectory_weights
+from ._requests import Precision, Stepping, initial_state, settings, trajectory_weights
 from ._states import Energy, State, StepReport
 
 if TYPE_CHECKING:
@@ -83,8 +83,8 @@ class Plant:
     substeps: int = 1
     #: How often a time step that cannot be solved is halved.
     halvings: int = 8
-    #: Where the solver stops: ``exact`` or ``fast``.
-    precision: str = "exact"
+    #: Where the solver stops: ``exact``, ``fast`` or ``coarse``.
+    precision: Precision = "exact"
     #: What was promised, if order and substeps were chosen by a tolerance.
     accuracy: Accuracy | None = None
     #: The bounds that protect it and which of them holds it, if there are any.
@@ -117,7 +117,7 @@ class Plant:
             m.settings.order,
             m.settings.substeps,
             m.settings.halvings,
-            plant_service_pb2.Precision.Name(m.settings.precision)[10:].lower(),
+            cast(Precision, plant_service_pb2.Precision.Name(m.settings.precision)[10:].lower()),
             Accuracy._from(m.accuracy) if m.HasField("accuracy") else None,
             m.safety if m.HasField("safety") else None,
             m.settings.singular_below,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Literal, TypedDict, Union
+from typing import Any, Literal, TypedDict, Union, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,8 @@ from ._states import State, Trajectory
 
 #: Bounds by the name of an entry: (lowest, highest), None for no bound; a number fixes the entry.
 Bounds = Mapping[str, Union[float, tuple[Union[float, None], Union[float, None]]]]
+#: Where the solver of a step stops: at round-off, or at about eleven or seven digits.
+Precision = Literal["exact", "fast", "coarse"]
 
 
 class Stepping(TypedDict, total=False):
@@ -32,8 +34,8 @@ class Stepping(TypedDict, total=False):
     substeps: int
     #: How often a time step that cannot be solved is halved, 0 to 8; 8 if not given.
     halvings: int
-    #: Where the solver stops: at round-off, if not given, or at about eleven digits.
-    precision: Literal["exact", "fast"]
+    #: Where the solver stops: at round-off, if not given, or at about eleven or seven digits.
+    precision: Precision
     #: Reciprocal condition below which a step is refused as singular; 1e-14 if not given.
     singular_below: float
     #: Newton iterations before a step is given up; 40 if not given.
@@ -47,7 +49,7 @@ def settings(
     order: int = 0,
     substeps: int = 0,
     halvings: int | None = None,
-    precision: Literal["exact", "fast"] = "exact",
+    precision: Precision = "exact",
     singular_below: float = 0.0,
     newton_iterations: int = 0,
     **unknown: object,
@@ -55,7 +57,7 @@ def settings(
     for argument in unknown:
         known = [*Stepping.__annotations__, *_arguments_of_call()]
         raise TypeError(f"there is no argument `{argument}`{instead(argument, known)}")
-    one_of("precision", precision, ("exact", "fast"))
+    one_of("precision", precision, get_args(Precision))
     split = plant_service_pb2.FORCE_SPLIT_PAPER if paper else plant_service_pb2.FORCE_SPLIT_SYMMETRIC
     return build(
         plant_service_pb2.PlantSettings,

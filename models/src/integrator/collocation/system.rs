@@ -527,7 +527,7 @@ impl System {
             let floor = if fresh { FLOOR } else { CHORD_FLOOR };
             let left = match settings.precision {
                 // What the correction will leave.
-                Precision::Fast if iteration > 1 => size * rate,
+                Precision::Fast | Precision::Coarse if iteration > 1 => size * rate,
                 _ => size,
             };
             let converged = left <= enough || (rate > SLOW && size <= floor);
@@ -586,7 +586,7 @@ impl System {
         let mut alike = self.alike.take()?;
         let enough = match settings.precision {
             Precision::Exact => settings.precision.residual(),
-            Precision::Fast => settings.precision.residual() * OF_LIGHT_BODIES,
+            Precision::Fast | Precision::Coarse => settings.precision.residual() * OF_LIGHT_BODIES,
         };
         let mut report = StepReport::default();
         let (mut previous, mut sluggish) = (f64::INFINITY, 0);
@@ -601,7 +601,9 @@ impl System {
             }
             let left = match settings.precision {
                 // What the correction will leave.
-                Precision::Fast if iteration > 1 => size * (size / previous).min(1.0),
+                Precision::Fast | Precision::Coarse if iteration > 1 => {
+                    size * (size / previous).min(1.0)
+                }
                 _ => size,
             };
             if iteration == 1 {

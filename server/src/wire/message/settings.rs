@@ -138,6 +138,7 @@ pub fn settings(
     settings.precision = match v1::Precision::try_from(given.precision) {
         Ok(v1::Precision::Unspecified | v1::Precision::Exact) => Precision::Exact,
         Ok(v1::Precision::Fast) => Precision::Fast,
+        Ok(v1::Precision::Coarse) => Precision::Coarse,
         Err(_) => return Err(RpcError::field("settings.precision", "is not a precision")),
     };
     if given.tolerance != 0.0 {
@@ -206,6 +207,7 @@ pub fn settings_message(settings: &Settings) -> v1::PlantSettings {
     let precision = match settings.precision {
         Precision::Exact => v1::Precision::Exact,
         Precision::Fast => v1::Precision::Fast,
+        Precision::Coarse => v1::Precision::Coarse,
     };
     v1::PlantSettings {
         time_step_s: settings.time_step_s,

@@ -111,15 +111,25 @@ impl Fmu {
 
     /// The settings in the library's keys: those that were given.
     fn recipe(&self) -> serde_json::Value {
-        let Settings { dt, paper, order, substeps, halvings, fast, max_iterations, singular_below } =
-            self.settings;
+        let Settings {
+            dt,
+            paper,
+            order,
+            substeps,
+            halvings,
+            fast,
+            coarse,
+            max_iterations,
+            singular_below,
+        } = self.settings;
         let mut recipe = json!({
             "at": self.at, "time_step_s": dt, "order": order, "substeps": substeps,
             "halvings": halvings, "max_iterations": max_iterations, "singular_below": singular_below,
         });
         if let Some(recipe) = recipe.as_object_mut() {
             recipe.retain(|_, value| !value.is_null());
-            let switches = [("fast", fast), ("paper", paper)].into_iter().filter(|(_, on)| *on);
+            let switches = [("fast", fast), ("coarse", coarse), ("paper", paper)];
+            let switches = switches.into_iter().filter(|(_, on)| *on);
             recipe.extend(switches.map(|(name, on)| (name.to_owned(), on.into())));
         }
         recipe

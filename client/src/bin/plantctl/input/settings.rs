@@ -25,6 +25,9 @@ pub(crate) struct Settings {
     /// Stop the solver at eleven digits instead of at round-off.
     #[arg(long)]
     pub(crate) fast: bool,
+    /// Stop it at seven digits: for errors of 1e-6 and more, by long steps of high order.
+    #[arg(long, conflicts_with = "fast")]
+    pub(crate) coarse: bool,
     /// Newton iterations before a step is given up.
     #[arg(long, value_name = "N")]
     pub(crate) max_iterations: Option<u32>,
@@ -37,8 +40,11 @@ impl From<Settings> for v1::PlantSettings {
     fn from(settings: Settings) -> Self {
         let split =
             if settings.paper { v1::ForceSplit::Paper } else { v1::ForceSplit::Unspecified };
-        let precision =
-            if settings.fast { v1::Precision::Fast } else { v1::Precision::Unspecified };
+        let precision = match settings {
+            Settings { coarse: true, .. } => v1::Precision::Coarse,
+            Settings { fast: true, .. } => v1::Precision::Fast,
+            _ => v1::Precision::Unspecified,
+        };
         Self {
             time_step_s: settings.dt.unwrap_or(0.0),
             force_split: split.into(),

@@ -32,7 +32,11 @@ pub(crate) fn list(plants: &[v1::PlantInfo]) -> Table {
 /// By which method a plant is stepped.
 pub(crate) fn stepping(plant: &v1::PlantInfo) -> String {
     let settings = plant.settings.unwrap_or_default();
-    let precision = if settings.precision() == v1::Precision::Fast { "fast" } else { "exact" };
+    let precision = match settings.precision() {
+        v1::Precision::Unspecified | v1::Precision::Exact => "exact",
+        v1::Precision::Fast => "fast",
+        v1::Precision::Coarse => "coarse",
+    };
     let (order, substeps, halvings) = (settings.order, settings.substeps, settings.halvings());
     let accuracy = plant.accuracy.as_ref().map_or(String::new(), |accuracy| {
         format!("; off by {} over {} steps", number(accuracy.error), accuracy.periods)
