@@ -9,9 +9,20 @@ mod registers;
 
 #[cfg(target_arch = "x86_64")]
 use crate::eights::registers::{Halves, Whole};
-use crate::rows::{Block, sum_of_eight};
+use crate::rows::{Block, LANES, sum_of_eight};
 #[cfg(target_arch = "x86_64")]
 use crate::simd::{AVX2, AVX512, has};
+
+/// A one in each place.
+pub const UNITS: [Block; LANES] = {
+    let mut units = [Block::ZERO; LANES];
+    let mut i = 0;
+    while i < LANES {
+        units[i].0[i] = 1.0;
+        i += 1;
+    }
+    units
+};
 
 /// Eight numbers.
 pub trait Eight: Copy + 'static {

@@ -16,8 +16,8 @@ use crate::compile::{inertia, pattern, settling};
 use crate::model::conditioning::Conditioning;
 use crate::model::mechanism::{
     Alignment, AlongAxis, Armature, Carries, Constraint, ConstraintKind, Coordinate, Coupling,
-    Dimensions, Length, Model, OperatingPoint, PathJoint, PathLength, PointDistance, PointPair,
-    Polynomial, Product, Solver, Vector,
+    Dimensions, Forces, Length, Model, OperatingPoint, PathJoint, PathLength, PointDistance,
+    PointPair, Polynomial, Product, Solver, Vector,
 };
 use crate::model::planar_tree::{crooked, planar};
 use crate::model::site::Site;
@@ -106,7 +106,8 @@ fn assemble(scene: &Scene, layout: Layout) -> Model {
     let damping = layout.damping(scene);
     let gravity = Vec3(scene.gravity.unwrap_or_default());
     let gravity = (gravity != Vec3::ZERO).then_some(gravity);
-    let needs_poses = forces.is_some() || potentials.couple_branches;
+    let acts_at_poses = |forces: &Forces| forces.need_poses(&layout.orientations);
+    let needs_poses = forces.as_ref().is_some_and(acts_at_poses) || potentials.couple_branches;
     let dimensions = Dimensions {
         dynamic,
         prescribed: layout.coordinates.len() - dynamic,

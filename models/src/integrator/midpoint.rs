@@ -13,7 +13,7 @@ use crate::lagrangian::arrangement::Planar;
 use crate::lagrangian::forces::Instant;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::{armature, forces};
-use crate::model::mechanism::{Armature, Model};
+use crate::model::mechanism::Model;
 use crate::model::tree::JointKind;
 
 /// The midpoint of an increment `x`: `q0 + ½x`, `x/h` with `1/h` given, and the first without whole turns.
@@ -151,19 +151,32 @@ impl<S: Planar> Midpoint<S> {
         }
     }
 
-    /// What springs, dampers and armatures of coordinates add to the diagonal of `K`.
+    /// What springs, armatures, dampers and forces of coordinates add to the diagonal of `K`.
     pub(crate) fn fill_diagonal(&self, model: &Model, settings: &Settings, diagonal: &mut [S]) {
         let h = settings.time_step_s;
         diagonal.fill(S::ZERO);
         if model.potentials.any {
-            let add = |i: usize, _, value: S| diagonal[i] -= value * (0.25 * h);
-            model.for_each_spring_derivative(&self.mechanics.poses, &self.q, add);
-            let add = |a: &Armature| diagonal[a.row] -= S::constant(a.inertia / h);
-            model.armature.iter().for_each(add);
+            let mut add = |i: usize, value: S| {
+                if let Some(entry) = diagonal.get_mut(i) {
+                    *entry -= value;
+                }
+            };
+            let spring = |i: usize, _, value: S| add(i, value * (0.25 * h));
+            model.for_each_spring_derivative(&self.mechanics.poses, &self.q, spring);
+            for armature in &model.armature {
+                add(armature.row, S::constant(armature.inertia / h));
+            }
         }
         let a = settings.force_split.at_start();
         for (entry, c) in diagonal.iter_mut().zip(&model.damping) {
             *entry -= S::constant(a * c);
+        }
+        if let Some(forces) = &model.forces {
+            forces.for_each_derivative(&self.instant(model), |i, _, by_q, by_v| {
+                if let Some(entry) = diagonal.get_mut(i) {
+                    *entry += (by_q * (0.5 * h) + by_v) * a;
+                }
+            });
         }
     }
 

@@ -8,6 +8,7 @@ use crate::integrator::midpoint::Midpoint;
 use crate::integrator::response::Response;
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
+use crate::kkt::planar::Diagonals;
 use crate::kkt::space::columns::OfBall;
 use crate::kkt::system::KktSystem;
 use crate::lagrangian::generators::Flanks;
@@ -98,8 +99,7 @@ impl ConstraintPair {
 /// What a linearization is made of, row-major.
 #[derive(Clone, Debug)]
 pub(crate) struct Tangents {
-    /// Springs and dampers of coordinates: of the residual by the start, of the momentum by the increment.
-    pub(crate) diagonals: [Vec<f64>; 2],
+    pub(crate) diagonals: Diagonals,
     /// `Σ λ D²h`.
     pub(crate) constraint_hessian: Vec<f64>,
     /// `½h L_qq + L_qv`.
@@ -137,7 +137,7 @@ impl Workspace {
             constraints: ConstraintPair { start: Closure::new(model), end: Closure::new(model) },
             kkt: KktSystem::new(model, spread(padded(2 * n))),
             tangents: Tangents {
-                diagonals: [zeros(nd), zeros(nd)],
+                diagonals: Diagonals::new(nd),
                 constraint_hessian: zeros(if nc > 0 { n * n } else { 0 }),
                 end_slopes: zeros(nd * nd),
                 flanks: vec![

@@ -24,7 +24,7 @@ use plantd_math::tree_lu::SmallestPivot;
 use crate::constraints::in_plane::InPlane;
 use crate::kkt::loops::column::Column;
 use crate::kkt::planar::columns::Columns;
-use crate::kkt::planar::{Diagonal, Method, dot3};
+use crate::kkt::planar::{Diagonals, Method, dot3};
 use crate::lagrangian::arrangement::Fours;
 use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::planar::Joints;
@@ -386,7 +386,7 @@ impl Multifrontal {
     pub(crate) fn linearize(
         &mut self,
         at: Mechanism<'_>,
-        diagonal: &Diagonal<'_>,
+        diagonal: &Diagonals,
         closures: &Closures<'_>,
         out: Derivatives<'_>,
     ) {
@@ -448,7 +448,7 @@ impl Multifrontal {
 struct Linearize<'a> {
     multifrontal: &'a mut Multifrontal,
     at: Mechanism<'a>,
-    diagonal: &'a Diagonal<'a>,
+    diagonal: &'a Diagonals,
     closures: &'a Closures<'a>,
     out: Derivatives<'a>,
 }

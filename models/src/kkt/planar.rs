@@ -55,11 +55,21 @@ struct Passage<S = f64> {
     w_over_d: Vec3<S>,
 }
 
-/// What springs and dampers of coordinates add: `−½h V_ii` to the derivative of the residual by the
-/// configuration, and to that of the momentum by the increment this and `−c`.
-pub(crate) struct Diagonal<'a> {
-    pub(crate) residual: &'a [f64],
-    pub(crate) momentum: &'a [f64],
+/// What springs, dampers and forces of coordinates give to the derivatives of a step: of the residual by the start, and
+/// of the momentum by the start and by the increment.
+#[derive(Clone, Debug)]
+pub(crate) struct Diagonals {
+    pub(crate) residual: Vec<f64>,
+    pub(crate) by_start: Vec<f64>,
+    pub(crate) by_increment: Vec<f64>,
+}
+
+impl Diagonals {
+    /// Zeros.
+    pub(crate) fn new(coordinates: usize) -> Self {
+        let zeros = || vec![0.0; coordinates];
+        Self { residual: zeros(), by_start: zeros(), by_increment: zeros() }
+    }
 }
 
 /// The matrix of a step.
@@ -344,7 +354,7 @@ impl PlanarRecursion {
         &mut self,
         tree: &Joints<Fours>,
         joints: &[PlanarJoint],
-        diagonal: &Diagonal<'_>,
+        diagonal: &Diagonals,
         increment: &mut [f64],
         momentum: &mut [f64],
         stride: usize,
@@ -365,7 +375,7 @@ struct Linearize<'a> {
     recursion: &'a mut PlanarRecursion,
     tree: &'a Joints<Fours>,
     joints: &'a [PlanarJoint],
-    diagonal: &'a Diagonal<'a>,
+    diagonal: &'a Diagonals,
     increment: &'a mut [f64],
     momentum: &'a mut [f64],
     stride: usize,

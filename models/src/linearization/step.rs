@@ -8,9 +8,10 @@ use crate::integrator::matrix::linearized;
 use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
 use crate::integrator::workspace::{StepContext, Tangents, Workspace};
+use crate::kkt::loops;
+use crate::kkt::planar::Diagonals;
 use crate::kkt::space::columns::{Own, Rows};
 use crate::kkt::system::Recursion;
-use crate::kkt::{loops, planar};
 use crate::lagrangian::planar::PlanarTree;
 use crate::linearization::linearize::{Kind, Linearization};
 use crate::model::mechanism::Model;
@@ -86,10 +87,9 @@ impl Workspace {
         else {
             return Ok(false);
         };
-        let [residual, momentum] = &self.tangents.diagonals;
-        let diagonal = planar::Diagonal { residual, momentum };
+        let diagonal = &self.tangents.diagonals;
         let (increment, momentum) = (&mut out.increment, &mut out.momentum);
-        recursion.linearize(tree, joints, &diagonal, increment, momentum, out.stride);
+        recursion.linearize(tree, joints, diagonal, increment, momentum, out.stride);
         Ok(true)
     }
 
@@ -124,18 +124,36 @@ impl Workspace {
         kkt.linearize_in_space(at, own, rows).map_err(|pivot| model.singular_matrix(pivot))
     }
 
-    /// The diagonals of springs and dampers of coordinates.
+    /// What springs, dampers and forces of coordinates give to the derivatives.
     fn fill_diagonals(&mut self, model: &Model, settings: &Settings) {
-        let h = settings.time_step_s;
-        let [residual, slope] = &mut self.tangents.diagonals;
+        let (h, a) = (settings.time_step_s, settings.force_split.at_start());
+        let Self { mid, tangents: Tangents { diagonals, .. }, .. } = self;
+        let Diagonals { residual, by_start, by_increment } = diagonals;
+        let nd = residual.len();
+        residual.fill(0.0);
+        by_start.fill(0.0);
+        by_increment.fill(0.0);
         if model.potentials.any {
-            residual.fill(0.0);
-            let poses = &self.mid.mechanics.poses;
-            let add = |i: usize, _, value| residual[i] -= 0.5 * h * value;
-            model.for_each_spring_derivative(poses, &self.mid.q, add);
+            let poses = &mid.mechanics.poses;
+            model.for_each_spring_derivative(poses, &mid.q, |i, _, value| {
+                if i < nd {
+                    residual[i] -= 0.5 * h * value;
+                    by_start[i] -= h * value;
+                    by_increment[i] -= 0.5 * h * value;
+                }
+            });
         }
-        for (i, slope) in slope.iter_mut().enumerate() {
-            *slope = residual[i] - model.damping.get(i).copied().unwrap_or_default();
+        for (slope, c) in by_increment.iter_mut().zip(&model.damping) {
+            *slope -= c;
+        }
+        if let Some(forces) = &model.forces {
+            forces.for_each_derivative(&mid.instant(model), |i, _, by_q, by_v| {
+                if i < nd {
+                    residual[i] += a * h * by_q;
+                    by_start[i] += h * by_q;
+                    by_increment[i] += 0.5 * h * by_q + by_v;
+                }
+            });
         }
     }
 
@@ -168,8 +186,7 @@ impl Workspace {
         ) else {
             return Ok(false);
         };
-        let [residual, momentum] = &self.tangents.diagonals;
-        let diagonal = planar::Diagonal { residual, momentum };
+        let diagonal = &self.tangents.diagonals;
         let closures = loops::Closures {
             jacobian: &self.constraints.end.jacobian,
             hessian: &self.tangents.constraint_hessian,
@@ -181,7 +198,7 @@ impl Workspace {
             stride: out.stride,
         };
         let mechanism = loops::Mechanism { loops, joints, tree, start, end };
-        fronts.linearize(mechanism, &diagonal, &closures, derivatives);
+        fronts.linearize(mechanism, diagonal, &closures, derivatives);
         Ok(true)
     }
 

@@ -229,6 +229,12 @@ impl Forces {
         let Self { wrenches, point_forces, linear_dampers, path_forces, .. } = self;
         wrenches.len() + point_forces.len() + linear_dampers.len() + path_forces.len()
     }
+
+    /// Whether they are more than forces on single coordinates, none of them of a ball joint.
+    pub(crate) fn need_poses(&self, orientations: &[usize]) -> bool {
+        let of_ball = |i: usize| orientations.iter().any(|first| (*first..first + 3).contains(&i));
+        self.coupling() > 0 || self.coordinate_forces.iter().any(|force| of_ball(force.coordinate))
+    }
 }
 
 /// A wrench on a joint that carries a body.
@@ -615,7 +621,7 @@ impl Model {
         let in_order = free.chain(moved.clone()).map(|joint| joint.coordinate);
         self.planar.is_none()
             && d.constraints == 0
-            && self.forces.is_none()
+            && self.forces.as_ref().is_none_or(|forces| !forces.need_poses(&self.orientations))
             && !self.potentials.couple_branches
             && in_order.eq(0..d.coordinates())
             && !moved.any(|joint| matches!(joint.kind, JointKind::Ball(_)))

@@ -5,13 +5,13 @@ use std::sync::Arc;
 use nalgebra::DMatrix;
 use plantd_math::rows::padded;
 use plantd_math::simd::narrowly;
-use plantd_scene::{Scene, builtin};
+use plantd_scene::{Force, Scene, builtin};
 
 use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
 use crate::integrator::workspace::{StepContext, Workspace};
 use crate::kkt::loops::{Closures, Derivatives, Mechanism, Scales};
-use crate::kkt::planar::Diagonal;
+use crate::kkt::planar::Diagonals;
 use crate::kkt::system::{Factors, Recursion};
 use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::planar::PlanarTree;
@@ -174,8 +174,20 @@ fn nested() -> Scene {
 
 fn scenes() -> Vec<Scene> {
     let mut scenes = vec![rope(), rungs(), nested()];
-    scenes
-        .extend(["scissor-2", "scissor-3", "scissor-8"].map(|name| builtin::scene(name).unwrap()));
+    let mut built_in =
+        ["scissor-2", "scissor-3", "scissor-8"].map(|name| builtin::scene(name).unwrap());
+    // With friction and stops.
+    for coordinate in built_in[1].coordinates.clone() {
+        built_in[1].forces.push(Force::Friction {
+            coordinate: Some(coordinate.name),
+            terms: Vec::new(),
+            points: Vec::new(),
+            force: 0.1,
+            velocity: 0.2,
+        });
+    }
+    assert!(!built_in[1].forces.is_empty());
+    scenes.extend(built_in);
     scenes
 }
 
@@ -358,7 +370,11 @@ fn wider_registers_give_the_same_bits() {
         };
         let d = model.dimensions();
         let numbers: Vec<f64> = (0..d.dynamic).map(|i| (i as f64).sin()).collect();
-        let diagonal = Diagonal { residual: &numbers, momentum: &numbers };
+        let diagonal = Diagonals {
+            residual: numbers.clone(),
+            by_start: numbers.clone(),
+            by_increment: numbers.clone(),
+        };
         let closures = Closures { jacobian: &end.jacobian, hessian: constraint_hessian };
         let conditioning = &model.conditioning;
         let scales = Scales { inertia: &conditioning.inertia, weight: &conditioning.weight };

@@ -5,10 +5,10 @@
 //! and the momentum take a pass up and one down each as well. What a joint passes on to the next one in the list
 //! stays in registers; only branches go through memory.
 
-use plantd_math::eights::Eight;
+use plantd_math::eights::{Eight, UNITS};
 use plantd_math::rows::{Block, LANES};
 
-use crate::kkt::planar::{Diagonal, Elimination, Passage};
+use crate::kkt::planar::{Diagonals, Elimination, Passage};
 use crate::lagrangian::arrangement::Fours;
 use crate::lagrangian::planar::Joints;
 use crate::lagrangian::plane::{Vec2, Vec3, cross};
@@ -37,17 +37,6 @@ pub(in crate::kkt) struct Columns {
     pub(in crate::kkt) increment: Vec<Block>,
     pub(in crate::kkt) momentum: Vec<Block>,
 }
-
-/// A one in each place.
-const UNITS: [Block; LANES] = {
-    let mut units = [Block::ZERO; LANES];
-    let mut i = 0;
-    while i < LANES {
-        units[i].0[i] = 1.0;
-        i += 1;
-    }
-    units
-};
 
 #[inline(always)]
 fn product<E: Eight>(vector: Vec3, [n, fx, fy]: [E; 3]) -> E {
@@ -166,7 +155,7 @@ impl Columns {
         &mut self,
         tree: &Joints<Fours>,
         joints: &[PlanarJoint],
-        diagonal: &Diagonal<'_>,
+        diagonal: &Diagonals,
         first: usize,
     ) {
         let n = joints.len();
@@ -236,7 +225,7 @@ impl Columns {
         &mut self,
         tree: &Joints<Fours>,
         joints: &[PlanarJoint],
-        diagonal: &Diagonal<'_>,
+        diagonal: &Diagonals,
         first: usize,
     ) {
         let step = self.step;
@@ -244,14 +233,15 @@ impl Columns {
         for i in (0..joints.len().min(first + LANES)).rev() {
             let (joint, link) = (&joints[i], tree.link(i));
             let mut flow = from_below(joint, below, &mut self.flows[i]);
-            let mut on_diagonal = E::ZERO;
+            let [mut by_start, mut of_momentum] = [E::ZERO; 2];
             if let Some(unit) = i.checked_sub(first).and_then(|lane| UNITS.get(lane)) {
                 let unit = E::of(unit);
                 let own = [link.slope[0], link.slope[1], link.slope[2], link.weight];
                 for (flow, own) in flow.iter_mut().zip(own) {
                     *flow = flow.plus(unit.scaled(own));
                 }
-                on_diagonal = unit.scaled(diagonal.residual[i]);
+                by_start = unit.scaled(diagonal.residual[i]);
+                of_momentum = unit.scaled(diagonal.by_start[i]);
             }
             let ([n, x, y, weight], s) = (flow, joint.body.turn);
             let stiffness = x
@@ -261,9 +251,9 @@ impl Columns {
                 .scaled(step);
             let force = n.scaled(s).plus(x.scaled(link.slide[0])).plus(y.scaled(link.slide[1]));
             let (by_x, by_p) = (&mut self.increment[i], &mut self.momentum[i]);
-            let own = stiffness.scaled(0.5).minus(force).plus(on_diagonal);
+            let own = stiffness.scaled(0.5).minus(force).plus(by_start);
             E::of(by_x).plus(own).put(by_x);
-            let own = stiffness.plus(on_diagonal.scaled(2.0));
+            let own = stiffness.plus(of_momentum);
             E::of(by_p).plus(own).put(by_p);
             let [ex, ey] = link.edge;
             let up = [n.plus(y.scaled(ex)).minus(x.scaled(ey)), x, y, weight];
@@ -301,7 +291,7 @@ impl Columns {
         &mut self,
         passages: &[Passage],
         joints: &[PlanarJoint],
-        diagonal: &Diagonal<'_>,
+        diagonal: &Diagonals,
     ) {
         let mut above = [E::ZERO; 3];
         for (i, joint) in joints.iter().enumerate() {
@@ -312,7 +302,7 @@ impl Columns {
             let x = right.minus(product(passages[i].w_over_d, flow));
             x.put(row);
             let moved = E::of(momentum).plus(product(slope, flow));
-            moved.plus(x.scaled(diagonal.momentum[i])).put(momentum);
+            moved.plus(x.scaled(diagonal.by_increment[i])).put(momentum);
             above = passed(&passages[i].down, flow, right, plus);
             pass_down(joint, above, &mut self.motions[i]);
         }
@@ -323,7 +313,7 @@ impl Columns {
     pub(in crate::kkt) fn carry_down<E: Eight>(
         &mut self,
         joints: &[PlanarJoint],
-        diagonal: &Diagonal<'_>,
+        diagonal: &Diagonals,
     ) {
         let mut above = [E::ZERO; 3];
         for (i, joint) in joints.iter().enumerate() {
@@ -331,7 +321,7 @@ impl Columns {
             let (x, momentum) = (E::of(&self.increment[i]), &mut self.momentum[i]);
             let flow = from_above(i, joint, above, &self.motions);
             let moved = E::of(momentum).plus(product(slope, flow));
-            moved.plus(x.scaled(diagonal.momentum[i])).put(momentum);
+            moved.plus(x.scaled(diagonal.by_increment[i])).put(momentum);
             let [turn, vx, vy] = flow;
             above = [
                 turn.plus(x.scaled(n)),

@@ -7,8 +7,8 @@ use plantd_math::rows::padded;
 use plantd_math::simd::narrowly;
 use plantd_scene::{Coordinate, CoordinateKind, Scene, builtin};
 
-use crate::integrator::settings::Settings;
-use crate::kkt::planar::Diagonal;
+use crate::integrator::settings::{ForceSplit, Settings};
+use crate::kkt::planar::Diagonals;
 use crate::kkt::system::Recursion;
 use crate::lagrangian::planar::PlanarTree;
 use crate::lagrangian::samples::{oblique, wave};
@@ -91,6 +91,21 @@ fn trees_that_leave_their_planes_are_not_planar() {
     assert!(!tilted("type = \"screw\", pitch = 0.1, axis = [0.0, 0.0, 1.0]"));
 }
 
+/// A chain with all forces that act on single coordinates.
+fn rubbing(n: usize) -> Model {
+    let mut text = builtin::scene(&format!("chain-{n}")).unwrap().to_toml();
+    for i in 0..n {
+        text += &format!(
+            "[[springs]]\ntype = \"stop\"\ncoordinate = \"link{i}\"\nrange = [-0.1, 0.1]\n\
+             stiffness = 5.0\ndamping = 0.3\ntransition = 0.2\n\
+             [[forces]]\ntype = \"friction\"\ncoordinate = \"link{i}\"\nforce = 0.1\nvelocity = 0.2\n\
+             [[forces]]\ntype = \"coordinate_drag\"\ncoordinate = \"link{i}\"\n\
+             coefficient = 0.2\ncubic = 0.1\n"
+        );
+    }
+    Model::compile(&Scene::from_toml(&text).unwrap()).unwrap()
+}
+
 /// What is missing to `AᵀΩA = Ω`.
 fn defect(a: &DMatrix<f64>) -> f64 {
     let n = a.nrows() / 2;
@@ -110,9 +125,15 @@ fn defect(a: &DMatrix<f64>) -> f64 {
 #[test]
 fn generators_stand_for_the_newton_matrix() {
     let chain = |n: usize| Model::compile(&builtin::scene(&format!("chain-{n}")).unwrap()).unwrap();
-    for model in [chain(7), chain(64), oblique(12, ""), oblique(13, "damping = 0.3")] {
+    for (i, model) in
+        [chain(7), chain(64), oblique(12, ""), oblique(13, "damping = 0.3"), rubbing(7), rubbing(7)]
+            .into_iter()
+            .enumerate()
+    {
         let model = Arc::new(model);
-        let mut fast = Plant::new(Arc::clone(&model), Settings::new(&model)).unwrap();
+        let force_split = if i == 5 { ForceSplit::Paper } else { ForceSplit::Symmetric };
+        let settings = Settings { force_split, ..Settings::new(&model) };
+        let mut fast = Plant::new(Arc::clone(&model), settings).unwrap();
         assert!(fast.workspace.kkt.has_recursion(), "{}", model.scene.name);
         let n = model.dimensions.dynamic;
         let q = (0..n).map(|i| 0.3 * wave(i)).collect();
@@ -132,7 +153,7 @@ fn generators_stand_for_the_newton_matrix() {
                 assert!((&a - &b).amax() <= 3e-9 * b.amax(), "{} {}", (a - &b).amax(), b.amax());
             }
             // In long chains sums about each joint keep digits that those about one origin lose.
-            if model.damping.is_empty() {
+            if model.damping.is_empty() && model.forces.is_none() {
                 let [own, others] = [by_generators.a(), by_entries.a()].map(|a| defect(&a));
                 assert!(own <= 2.0 * others + 1e-13, "{own} {others}");
             }
@@ -154,7 +175,11 @@ fn linearizations_have_the_same_bits_in_any_register() {
         let tree = mechanics.planar.as_deref().and_then(PlanarTree::many).unwrap();
         let (joints, stride) = (model.planar.as_ref().unwrap(), padded(2 * n));
         let numbers: Vec<f64> = (0..n).map(wave).collect();
-        let diagonal = Diagonal { residual: &numbers, momentum: &numbers };
+        let diagonal = Diagonals {
+            residual: numbers.clone(),
+            by_start: numbers.clone(),
+            by_increment: numbers.clone(),
+        };
         let Recursion::Planar(recursion) = &plant.workspace.kkt.factored.recursion else {
             panic!()
         };

@@ -23,11 +23,12 @@
 
 use std::ops::Range;
 
-use plantd_math::eights::{Eight, InEights, in_eights};
+use plantd_math::eights::{Eight, InEights, UNITS, in_eights};
 use plantd_math::rows::{Block, LANES};
 use plantd_math::spatial::Mat3;
 use plantd_math::tree_lu::SmallestPivot;
 
+use crate::kkt::planar::Diagonals;
 use crate::kkt::space::{
     Added, Fork, Group, GroupKind, Limb, SpatialRecursion, Sums, WIDEST, Watch, combined,
 };
@@ -77,8 +78,7 @@ impl OfBall {
 /// What joints have of themselves: springs and dampers of coordinates, and balls.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Own<'a> {
-    /// Of the residual by the start, and of the momentum by the increment.
-    pub(crate) diagonals: &'a [Vec<f64>; 2],
+    pub(crate) diagonals: &'a Diagonals,
     pub(crate) turnings: &'a [Turning],
     pub(crate) balls: &'a [OfBall],
 }
@@ -101,17 +101,6 @@ pub(crate) struct Columns {
     increment: Vec<Block>,
     momentum: Vec<Block>,
 }
-
-/// A one in each place.
-const UNITS: [Block; LANES] = {
-    let mut units = [Block::ZERO; LANES];
-    let mut i = 0;
-    while i < LANES {
-        units[i].0[i] = 1.0;
-        i += 1;
-    }
-    units
-};
 
 /// The unit of a column, where it is one of a block.
 #[inline(always)]
@@ -393,7 +382,9 @@ impl<E: Eight> Watch<E> for Keep<'_> {
         for (i, margin) in group.axes.clone().zip(&mut *margins) {
             margin.take(&Flanks::of(&step.parts::<E>(curvature, i)));
         }
-        let diagonals = [0, 1].map(|k: usize| &own.diagonals[k][group.rows.clone()]);
+        let Diagonals { residual, by_start, by_increment } = own.diagonals;
+        let diagonals =
+            [residual, by_start, by_increment].map(|diagonal| &diagonal[group.rows.clone()]);
         match axes {
             [a] => write_among([a], margins, diagonals, among, sums),
             [a, b] => write_among([a, b], margins, diagonals, among, sums),
@@ -445,7 +436,7 @@ impl Among {
 fn write_among<E: Eight, const W: usize>(
     axes: [&Generators; W],
     margins: &mut [Margin],
-    [residual, momentum]: [&[f64]; 2],
+    [residual, by_start, by_increment]: [&[f64]; 3],
     among: &mut Among,
     sums: Option<&Sums<E>>,
 ) {
@@ -465,8 +456,8 @@ fn write_among<E: Eight, const W: usize>(
             among.by_increment[b][a] = plus.dot(push);
         }
         among.residual[a][a] += residual[a];
-        among.by_start[a][a] += 2.0 * residual[a];
-        among.by_increment[a][a] += momentum[a];
+        among.by_start[a][a] += by_start[a];
+        among.by_increment[a][a] += by_increment[a];
     }
     if let Some(sums) = sums {
         include(axes, margins, among, sums);
