@@ -6,6 +6,7 @@ use std::sync::Arc;
 use crate::common::random_scene::{self, Kind};
 use crate::common::{builtin, methods};
 use plantd_models::{Initial, Linearization, Model, Plant, Precision, Scene, Settings, Snapshot};
+use plantd_scene::{Coordinate, CoordinateKind, Force};
 
 /// Steps after a snapshot.
 const STEPS: u32 = 20;
@@ -125,6 +126,39 @@ fn built_in_scenes_go_on_bit_for_bit() {
                     let _ = restored_goes_on(&mut plant, &format!("{name}, {settings:?}"));
                 }
             }
+        }
+    }
+}
+
+/// Chains that go by generators in space: moved at the support and on the way, and with friction at each joint.
+#[test]
+fn chains_that_are_moved_go_on_bit_for_bit() {
+    for with_friction in [false, true] {
+        let mut scene = builtin("chain-20");
+        for link in ["link0", "link7"] {
+            scene.coordinates.retain(|coordinate| coordinate.name != link);
+            scene.coordinates.push(Coordinate {
+                name: link.to_owned(),
+                kind: CoordinateKind::Prescribed,
+                ..Coordinate::default()
+            });
+        }
+        scene.inputs[0].coordinate = Some("link3".to_owned());
+        for i in (1..20).filter(|i| with_friction && *i != 7) {
+            scene.forces.push(Force::Friction {
+                coordinate: Some(format!("link{i}")),
+                terms: Vec::new(),
+                points: Vec::new(),
+                force: 0.05,
+                velocity: 0.1,
+            });
+        }
+        let model = Model::compile(&scene).unwrap();
+        assert!(model.plan().contains("by generators, 20 joints"), "{}", model.plan());
+        for precision in [Precision::Exact, Precision::Fast, Precision::Coarse] {
+            let settings = Settings { precision, ..Settings::new(&model) };
+            let mut plant = starts(&scene, settings).unwrap();
+            assert!(restored_goes_on(&mut plant, &format!("{settings:?}")));
         }
     }
 }

@@ -70,6 +70,13 @@ pub(crate) struct InSpace {
     columns: Columns,
 }
 
+impl InSpace {
+    pub(crate) fn new(model: &Model) -> Self {
+        let recursion = SpatialRecursion::new(model);
+        Self { columns: recursion.columns(), recursion }
+    }
+}
+
 /// Which factors are valid.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) enum Factors {
@@ -125,10 +132,11 @@ impl KktSystem {
     /// Room for the factors, by what suits the model; columns of the Schur complement are `stride` apart.
     pub(crate) fn new(model: &Model, stride: usize) -> Self {
         let nd = model.dimensions.dynamic;
-        let in_space = model.is_generated_in_space().then(|| {
-            let recursion = SpatialRecursion::new(model);
-            Box::new(InSpace { columns: recursion.columns(), recursion })
-        });
+        let entries = model.elimination.entries();
+        let in_space = (model.is_generated_in_space())
+            .then(|| InSpace::new(model))
+            .filter(|own| own.recursion.is_faster_by_columns(entries))
+            .map(Box::new);
         Self {
             factored: Factored::new(model),
             in_space,

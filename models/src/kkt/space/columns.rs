@@ -519,6 +519,19 @@ impl InEights for Linearize<'_> {
 }
 
 impl SpatialRecursion {
+    /// Whether a linearization takes less time by columns than with so many entries in each triangle of the Newton
+    /// matrix. What forks cost is in the number of limbs. Of the time entry by entry it took:
+    ///
+    /// ```text
+    /// entries over joints and limbs      tree-7 1.2   tree-15 1.6   tree-30 2.1   tree-63 2.5   tree-127 3.1
+    /// time                                      1.5           1.5          1.4           1.5            1.45
+    /// entries over joints and limbs      arm of 7 hinges 3.5   balls-3 3   walker-2 4.6   walker-4 5.1   chain-8 4
+    /// time                                             0.9           0.8            0.7            0.7         0.85
+    /// ```
+    pub(crate) fn is_faster_by_columns(&self, entries: usize) -> bool {
+        10 * entries > 31 * (self.axes.len() + self.limbs.len())
+    }
+
     /// Room for the linearization.
     pub(crate) fn columns(&self) -> Columns {
         Columns::new(self.axes.len(), self.groups.len(), self.flows.len())

@@ -11,7 +11,7 @@ use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
 use crate::integrator::workspace::Workspace;
 use crate::kkt::space::SpatialRecursion;
-use crate::kkt::system::{Linearized, Recursion};
+use crate::kkt::system::{InSpace, Linearized, Recursion};
 use crate::lagrangian::generators::MatrixKind;
 use crate::linearization::linearize::Linearization;
 use crate::model::mechanism::{Model, Solver};
@@ -186,6 +186,7 @@ fn both(model: &Arc<Model>, order: u32) -> [Plant; 2] {
     assert!(order == 2 || model.solver == Solver::Spatial);
     let generators = SpatialRecursion::new(model);
     fast.workspace.kkt.factored.recursion = Recursion::Spatial(Box::new(generators));
+    fast.workspace.kkt.in_space = Some(Box::new(InSpace::new(model)));
     let n = model.dimensions.coordinates();
     let turned = |i: usize| if i < 2 { 0.5 } else { 0.02 * (1.3 * i as f64).sin() };
     let q = (0..n).map(turned).collect();
