@@ -101,6 +101,12 @@ fn a_plant_is_stepped_by_the_method_asked_for() {
     assert!(shown.contains("order 6, substeps 3, halvings 0 at most, fast"), "{shown}");
     assert!(text(&server, &["step", "p1"]).contains("in 3 steps, residual"));
     assert_eq!(json(&server, &["step", "p1"])["report"]["steps"], 3);
+    let coarse = json(&server, &["create", "pendulum", "--order", "8", "--coarse"]);
+    assert_eq!(coarse["settings"]["precision"], "PRECISION_COARSE");
+    let shown = text(&server, &["show", "plant", coarse["id"].as_str().unwrap()]);
+    assert!(shown.contains("at most, coarse"), "{shown}");
+    let both = run(&server, &["create", "pendulum", "--fast", "--coarse"]);
+    assert!(stderr(&both).contains("cannot be used with"), "{}", stderr(&both));
     let chosen = json(&server, &["create", "pendulum", "--tolerance", "1e-6"]);
     assert!(chosen["accuracy"]["error"].as_f64().unwrap() <= 1e-6, "{chosen}");
     let id = chosen["id"].as_str().unwrap();

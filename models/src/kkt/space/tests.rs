@@ -243,6 +243,36 @@ fn collocation_and_linearization_are_those_entry_by_entry() {
     }
 }
 
+/// What is missing to the symplectic form of a map without forces, relative to its entries.
+fn defect(a: &DMatrix<f64>) -> f64 {
+    let n = a.nrows() / 2;
+    let mut omega = DMatrix::zeros(2 * n, 2 * n);
+    (0..n).for_each(|i| (omega[(i, i + n)], omega[(i + n, i)]) = (1.0, -1.0));
+    (a.transpose() * &omega * a - &omega).amax() / a.amax().powi(2)
+}
+
+/// Sums about one origin lose digits in long chains; the entries of a matrix, and its elimination, lose more.
+#[test]
+fn derivatives_are_as_symplectic_as_entry_by_entry() {
+    for model in [rope(16, ""), rope(64, ""), rope(128, "")].map(|text| compiled(&text)) {
+        let model = Arc::new(model);
+        let mut linear = [Linearization::new(&model), Linearization::new(&model)];
+        let [mut fast, mut slow] = both(&model, 2);
+        let mut worst = [0.0_f64; 2];
+        for _ in 0..20 {
+            slow.restore(&fast.snapshot()).unwrap();
+            for ((plant, out), worst) in
+                [&mut fast, &mut slow].into_iter().zip(&mut linear).zip(&mut worst)
+            {
+                plant.step_and_linearize(&[], out).unwrap();
+                *worst = worst.max(defect(&out.a()));
+            }
+        }
+        let [own, others] = worst;
+        assert!(own <= 1.5 * others, "{own:e} {others:e}");
+    }
+}
+
 /// A floating hull with limbs of ball joints and hinges, damped, with armatures and inputs.
 fn floating() -> Model {
     let mut text = "format = 1\nname = \"floating\"\ngravity = [1.0, -2.0, -9.0]\n\
