@@ -16,9 +16,9 @@
 //! ```
 //!
 //! as in [`planar`](crate::kkt::planar), from the leaves to the root; the pivots are those of an elimination axis
-//! by axis. Each step up the tree waits for the one before, so it counts how many there are. As all sums are about
-//! one origin, the solution loses digits in long chains (up to 1e-11 of it in one of 64 hinges), which the next
-//! correction makes good.
+//! by axis. A joint whose motion is prescribed is passed by: `A` goes on to its parent as it is. Each step up the
+//! tree waits for the one before, so it counts how many there are. As all sums are about one origin, the solution
+//! loses digits in long chains (up to 1e-11 of it in one of 64 hinges), which the next correction makes good.
 
 pub(crate) mod columns;
 #[cfg(test)]

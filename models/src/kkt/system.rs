@@ -157,7 +157,8 @@ impl KktSystem {
     }
 
     /// Factors by the recursion: false where there is none or its pivots are not sound, and the tree has to
-    /// do. Of limbs that are held `K` is filled. The error is a pivot that is too small. Of masses alone all pivots of trees are taken.
+    /// do. Of limbs that are held `K` is filled. The error is a pivot that is too small. Of masses alone all
+    /// pivots of trees are taken.
     pub(crate) fn factor_recursion(
         &mut self,
         at: Linearized<'_>,
@@ -227,7 +228,8 @@ impl KktSystem {
         }
     }
 
-    /// Factors by generators in space at the last second derivatives, with the derivatives of the step: false where there is no such recursion.
+    /// Factors by generators in space at the last second derivatives, and writes the derivatives of the step; false
+    /// where there is no room for that. The error is a pivot that is too small.
     pub(crate) fn linearize_in_space(
         &mut self,
         at: Linearized<'_>,

@@ -20,6 +20,10 @@
 //!
 //! with `G = own + minus · A above`. A row costs 24 products and sums for a column, and 24 more if it is above the
 //! joint of the column.
+//!
+//! A joint whose motion is prescribed has no row and two columns. Each of its ends takes the midpoint half as far, and
+//! the velocity by `∓1/h`, which is what an increment does, and the same with the other sign: `above` and `below` are
+//! `minus` and `lower` by its position at the start, `plus` and `upper` by the next one.
 
 use std::ops::Range;
 
@@ -75,7 +79,7 @@ impl OfBall {
         Self { residual: Mat3::ZERO, by_start: Mat3::ZERO, by_increment: Mat3::ZERO };
 }
 
-/// What joints have of themselves: springs and dampers of coordinates, and balls.
+/// What joints have of themselves: springs, dampers and forces of coordinates, and balls.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Own<'a> {
     pub(crate) diagonals: &'a Diagonals,
@@ -403,7 +407,6 @@ impl Margin {
         flanks.below.put(&mut self.below);
     }
 
-    /// An end that moves takes the midpoint half as far, and the velocity by `∓1/h`.
     #[inline(always)]
     fn take_prescribed<E: Eight>(&mut self, own: &Generators<E>, sums: Option<&Sums<E>>) {
         let Self { carry, push, above, below } = self;
