@@ -116,8 +116,9 @@ fn assemble(scene: &Scene, layout: Layout) -> Model {
     };
     // Generators in planes know no joints that are moved, those in space do: a chain of 16 that hangs from one takes
     // 0.75 of the time, one of 64 a quarter.
-    let is_moved = dimensions.prescribed > 0 && dimensions.constraints == 0;
-    let goes_to_space = needs_poses || (is_moved && Solver::is_deep(&elimination));
+    let is_moved = dynamics.joints.iter().any(|joint| joint.coordinate >= dynamic);
+    let is_free = dimensions.constraints == 0;
+    let goes_to_space = needs_poses || (is_moved && is_free && Solver::is_deep(&elimination));
     let planar = if goes_to_space { None } else { planar(&dynamics, gravity) };
     let mut model = Model {
         conditioning: Conditioning::default(),

@@ -136,6 +136,21 @@ pub(crate) fn wave(i: usize) -> f64 {
     (12.9898 * i as f64 + 0.3).sin()
 }
 
+/// Friction, drag and stops of coordinates: a prefix and numbers.
+pub(crate) fn rubbing(prefix: &str, count: usize) -> String {
+    let mut text = String::new();
+    for i in 0..count {
+        text += &format!(
+            "[[springs]]\ntype = \"stop\"\ncoordinate = \"{prefix}{i}\"\nrange = [-0.1, 0.1]\n\
+             stiffness = 5.0\ndamping = 0.3\ntransition = 0.2\n\
+             [[forces]]\ntype = \"friction\"\ncoordinate = \"{prefix}{i}\"\nforce = 0.1\nvelocity = 0.2\n\
+             [[forces]]\ntype = \"coordinate_drag\"\ncoordinate = \"{prefix}{i}\"\n\
+             coefficient = 0.2\ncubic = 0.1\n"
+        );
+    }
+    text
+}
+
 /// Trees in oblique planes: hinges both ways about, sliders, bodies off the plane, two roots, and a floating
 /// base of massless joints. `extra` goes on the coordinates.
 pub(crate) fn oblique(n: usize, extra: &str) -> Model {

@@ -10,7 +10,7 @@ use crate::model::held::Held;
 use crate::model::loop_plan::Loops;
 use crate::model::planar_tree::PlanarJoints;
 use crate::model::signal::{Signal, Target};
-use crate::model::tree::{Attachment, Joint, JointKind, Tree};
+use crate::model::tree::{Attachment, Tree};
 
 /// A compiled scene: immutable, shared by all plants made from it.
 #[derive(Debug)]
@@ -112,8 +112,7 @@ impl Solver {
         if model.is_generated_in_space() {
             return if Self::is_deep(&model.elimination) { Self::Spatial } else { Self::Tree };
         }
-        let coordinates = model.dynamics.joints.iter().map(|joint| joint.coordinate);
-        let is_free = d.constraints == 0 && coordinates.eq(0..d.dynamic);
+        let is_free = d.constraints == 0 && d.prescribed == 0 && model.joints_are_in_order();
         if model.planar.is_some() && is_free && d.dynamic >= Self::MANY {
             Self::Planar
         } else {
@@ -612,19 +611,23 @@ pub struct OperatingPoint {
 
 impl Model {
     /// Whether vectors of the joints generate the whole Newton matrix in space: without constraints, springs between
-    /// points, forces, and ball joints that are moved.
+    /// points, forces at points, and ball joints that are moved.
     pub(crate) fn is_generated_in_space(&self) -> bool {
-        let (d, joints) = (self.dimensions, &self.dynamics.joints[..]);
-        let is_moved = |joint: &&Joint| joint.coordinate >= d.dynamic;
-        let free = joints.iter().filter(|joint| !is_moved(joint));
-        let mut moved = joints.iter().filter(is_moved);
-        let in_order = free.chain(moved.clone()).map(|joint| joint.coordinate);
+        let d = self.dimensions;
         self.planar.is_none()
             && d.constraints == 0
             && self.forces.as_ref().is_none_or(|forces| !forces.need_poses(&self.orientations))
             && !self.potentials.couple_branches
-            && in_order.eq(0..d.coordinates())
-            && !moved.any(|joint| matches!(joint.kind, JointKind::Ball(_)))
+            && self.joints_are_in_order()
+            && self.orientations.iter().all(|first| *first < d.dynamic)
+    }
+
+    /// Whether each coordinate has a joint, the dynamic ones in their order, and so the prescribed ones.
+    fn joints_are_in_order(&self) -> bool {
+        let coordinates = || self.dynamics.joints.iter().map(|joint| joint.coordinate);
+        let dynamic = coordinates().filter(|i| *i < self.dimensions.dynamic);
+        let prescribed = coordinates().filter(|i| *i >= self.dimensions.dynamic);
+        dynamic.chain(prescribed).eq(0..self.dimensions.coordinates())
     }
 
     /// The scene it was compiled from.

@@ -11,7 +11,7 @@ use crate::integrator::settings::{ForceSplit, Settings};
 use crate::kkt::planar::Diagonals;
 use crate::kkt::system::Recursion;
 use crate::lagrangian::planar::PlanarTree;
-use crate::lagrangian::samples::{oblique, wave};
+use crate::lagrangian::samples::{oblique, rubbing, wave};
 use crate::linearization::linearize::Linearization;
 use crate::model::mechanism::{Model, Solver};
 use crate::plant::facade::Plant;
@@ -92,17 +92,8 @@ fn trees_that_leave_their_planes_are_not_planar() {
 }
 
 /// A chain with all forces that act on single coordinates.
-fn rubbing(n: usize) -> Model {
-    let mut text = builtin::scene(&format!("chain-{n}")).unwrap().to_toml();
-    for i in 0..n {
-        text += &format!(
-            "[[springs]]\ntype = \"stop\"\ncoordinate = \"link{i}\"\nrange = [-0.1, 0.1]\n\
-             stiffness = 5.0\ndamping = 0.3\ntransition = 0.2\n\
-             [[forces]]\ntype = \"friction\"\ncoordinate = \"link{i}\"\nforce = 0.1\nvelocity = 0.2\n\
-             [[forces]]\ntype = \"coordinate_drag\"\ncoordinate = \"link{i}\"\n\
-             coefficient = 0.2\ncubic = 0.1\n"
-        );
-    }
+fn rubbing_chain(n: usize) -> Model {
+    let text = builtin::scene(&format!("chain-{n}")).unwrap().to_toml() + &rubbing("link", n);
     Model::compile(&Scene::from_toml(&text).unwrap()).unwrap()
 }
 
@@ -125,10 +116,16 @@ fn defect(a: &DMatrix<f64>) -> f64 {
 #[test]
 fn generators_stand_for_the_newton_matrix() {
     let chain = |n: usize| Model::compile(&builtin::scene(&format!("chain-{n}")).unwrap()).unwrap();
-    for (i, model) in
-        [chain(7), chain(64), oblique(12, ""), oblique(13, "damping = 0.3"), rubbing(7), rubbing(7)]
-            .into_iter()
-            .enumerate()
+    for (i, model) in [
+        chain(7),
+        chain(64),
+        oblique(12, ""),
+        oblique(13, "damping = 0.3"),
+        rubbing_chain(7),
+        rubbing_chain(7),
+    ]
+    .into_iter()
+    .enumerate()
     {
         let model = Arc::new(model);
         let force_split = if i == 5 { ForceSplit::Paper } else { ForceSplit::Symmetric };
@@ -211,4 +208,27 @@ fn a_prescribed_leaf_is_left_to_the_elimination_tree() {
     // Without the prescribed position and velocity.
     let (a, place) = (out.a(), |i: usize| if i < 5 { i } else { i + 1 });
     assert!(defect(&DMatrix::from_fn(10, 10, |i, j| a[(place(i), place(j))])) < 1e-10);
+}
+
+/// A pointer without mass, which is moved and moves nothing, has columns all the same.
+#[test]
+fn what_is_moved_and_moves_nothing_leaves_the_derivatives_as_they_are() {
+    let chain = builtin::scene("chain-6").unwrap();
+    let pointer = "[[frames]]\nname = \"pointer\"\njoint = { type = \"revolute\", axis = [0.0, 1.0, 0.0] }\n\
+                   [[coordinates]]\nname = \"pointer\"\nkind = \"prescribed\"\n";
+    let with_pointer = Scene::from_toml(&(chain.to_toml() + pointer)).unwrap();
+    let [alone, moved] = [chain, with_pointer].map(|scene| {
+        let model = Arc::new(Model::compile(&scene).unwrap());
+        let mut plant = Plant::new(Arc::clone(&model), Settings::new(&model)).unwrap();
+        let mut out = Linearization::new(&model);
+        let mut u = vec![0.1];
+        u.resize(model.dimensions.input(), 0.001);
+        for _ in 0..3 {
+            plant.step_and_linearize(&u, &mut out).unwrap();
+        }
+        out.a()
+    });
+    let place = |i: usize| if i < 6 { i } else { i + 1 };
+    let same = DMatrix::from_fn(12, 12, |i, j| moved[(place(i), place(j))]);
+    assert!((&same - &alone).amax() < 1e-12 * alone.amax(), "{:e}", (same - &alone).amax());
 }

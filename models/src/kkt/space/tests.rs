@@ -13,6 +13,7 @@ use crate::integrator::workspace::Workspace;
 use crate::kkt::space::SpatialRecursion;
 use crate::kkt::system::{InSpace, Linearized, Recursion};
 use crate::lagrangian::generators::MatrixKind;
+use crate::lagrangian::samples::rubbing;
 use crate::linearization::linearize::Linearization;
 use crate::model::mechanism::{Model, Solver};
 use crate::plant::facade::Plant;
@@ -67,21 +68,6 @@ fn branching(n: usize, extra: &str, more: &str) -> Model {
         );
     }
     compiled(&text)
-}
-
-/// Friction, drag and stops on the coordinates of a tree that branches.
-fn rubbing(n: usize) -> String {
-    let mut text = "gravity = [1.0, -2.0, -9.0]\ntime_step_s = 0.002\n".to_owned();
-    for i in 0..n {
-        text += &format!(
-            "[[springs]]\ntype = \"stop\"\ncoordinate = \"f{i}\"\nrange = [-0.1, 0.1]\n\
-             stiffness = 5.0\ndamping = 0.3\ntransition = 0.2\n\
-             [[forces]]\ntype = \"friction\"\ncoordinate = \"f{i}\"\nforce = 0.1\nvelocity = 0.2\n\
-             [[forces]]\ntype = \"coordinate_drag\"\ncoordinate = \"f{i}\"\n\
-             coefficient = 0.2\ncubic = 0.1\n"
-        );
-    }
-    text
 }
 
 /// A rope of 1 m and 1 kg: thin rods hinged about x and y by turns.
@@ -221,11 +207,13 @@ fn long_chains_move_as_they_do_entry_by_entry() {
 
 #[test]
 fn collocation_and_linearization_are_those_entry_by_entry() {
+    let scratched =
+        "gravity = [1.0, -2.0, -9.0]\ntime_step_s = 0.002\n".to_owned() + &rubbing("f", 40);
     for (model, order) in [
         (compiled(&rope(64, "")), 4),
         (compiled(&rope(20, "[[inputs]]\nname = \"u\"\ncoordinate = \"f3\"\n")), 2),
         (branching(40, "gravity = [1.0, -2.0, -9.0]\ntime_step_s = 0.002", "damping = 0.3"), 2),
-        (branching(40, &rubbing(40), "armature = 0.1"), 2),
+        (branching(40, &scratched, "armature = 0.1"), 2),
     ] {
         let model = Arc::new(model);
         let [mut fast, mut slow] = both(&model, order);
