@@ -82,16 +82,21 @@ impl Workspace {
         if model.held.is_some() {
             self.fill_newton_matrix(model, settings);
         } else {
-            self.mid.fill_diagonal(model, settings, &mut self.kkt.diagonal);
-            if !model.orientations.is_empty() {
-                self.weigh_balls(model, settings);
-            }
+            self.weigh_coordinates(model, settings);
         }
         let constraints = [&self.constraints.start, &self.constraints.end];
         let at = linearized(model, settings, &mut self.mid.mechanics, constraints);
         self.kkt
             .factor_recursion(at, MatrixKind::Newton)
             .map_err(|pivot| model.singular_matrix(pivot))
+    }
+
+    /// What recursions need of coordinates at the last evaluation, beside the bodies.
+    pub(crate) fn weigh_coordinates(&mut self, model: &Model, settings: &Settings) {
+        self.mid.fill_diagonal(model, settings, &mut self.kkt.diagonal);
+        if !model.orientations.is_empty() {
+            self.weigh_balls(model, settings);
+        }
     }
 
     /// Factors the mass matrix by the recursion, with the constraints at the start; whether that went well.

@@ -339,9 +339,16 @@ impl InEights for Factor<'_> {
 
     #[inline(always)]
     fn run<E: Eight>(self) -> SmallestPivot {
+        self.watched::<E>(&mut ())
+    }
+}
+
+impl Factor<'_> {
+    #[inline(always)]
+    fn watched<E: Eight>(self, watch: &mut impl Watch<E>) -> SmallestPivot {
         let Self { recursion, curvature, added, inertia, step } = self;
         recursion.generate::<E>(curvature, &step, added);
-        recursion.eliminate::<E>(|axis| inertia[axis] * step.inverse.abs(), &mut ())
+        recursion.eliminate::<E>(|axis| inertia[axis] * step.inverse.abs(), watch)
     }
 }
 

@@ -73,7 +73,7 @@ pub(crate) struct InSpace {
 impl InSpace {
     pub(crate) fn new(model: &Model) -> Self {
         let recursion = SpatialRecursion::new(model);
-        Self { columns: recursion.columns(), recursion }
+        Self { columns: Columns::new(&recursion), recursion }
     }
 }
 

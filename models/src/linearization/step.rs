@@ -103,14 +103,13 @@ impl Workspace {
         if self.kkt.in_space.is_none() {
             return Ok(false);
         }
-        self.mid.fill_diagonal(model, settings, &mut self.kkt.diagonal);
+        self.weigh_coordinates(model, settings);
         self.mid.mechanics.differentiate(model);
         self.fill_diagonals(model, settings);
         out.turnings.clear();
         if model.orientations.is_empty() {
             fill_inputs(at, out);
         } else {
-            self.weigh_balls(model, settings);
             self.find_turnings(at, out);
             self.fill_turned_inputs(model, out);
         }

@@ -34,7 +34,7 @@ use plantd_math::tree_lu::SmallestPivot;
 
 use crate::kkt::planar::Diagonals;
 use crate::kkt::space::{
-    Added, Fork, Group, GroupKind, Limb, SpatialRecursion, Sums, WIDEST, Watch, combined,
+    Added, Factor, Fork, Group, GroupKind, Limb, SpatialRecursion, Sums, WIDEST, Watch, combined,
 };
 use crate::lagrangian::curvature::Curvature;
 use crate::lagrangian::generators::{Flanks, Generators, Step};
@@ -128,6 +128,16 @@ fn add<E: Eight>(flow: &mut [E; 8], vector: &Block, times: E) {
     }
 }
 
+/// Adds what a joint that is moved gives to its two columns.
+#[inline(always)]
+fn add_moved<E: Eight>(flow: &mut [E; 8], vectors: [&Block; 2], columns: [usize; 2], first: usize) {
+    for (vector, column) in vectors.into_iter().zip(columns) {
+        if let Some(unit) = unit::<E>(column, first) {
+            add(flow, vector, unit);
+        }
+    }
+}
+
 #[inline(always)]
 fn of_blocks<E: Eight>(blocks: &[Block; 8]) -> [E; 8] {
     let mut all = [E::ZERO; 8];
@@ -138,10 +148,13 @@ fn of_blocks<E: Eight>(blocks: &[Block; 8]) -> [E; 8] {
 }
 
 impl Columns {
-    pub(in crate::kkt) fn new(joints: usize, groups: usize, places: usize) -> Self {
+    /// Room for a linearization by a recursion.
+    pub(crate) fn new(recursion: &SpatialRecursion) -> Self {
+        let SpatialRecursion { axes, groups, flows, .. } = recursion;
+        let (joints, places) = (axes.len(), flows.len());
         Self {
             margins: vec![Margin::default(); joints],
-            among: vec![Among::default(); groups],
+            among: vec![Among::default(); groups.len()],
             flows: vec![[Block::ZERO; 8]; places],
             motions: vec![[Block::ZERO; 8]; places],
             increment: vec![Block::ZERO; joints],
@@ -170,13 +183,9 @@ impl Columns {
                 let Group { axes: range, rows, kind, reach } = &groups[at];
                 any = any || reach.iter().any(|reach| has(reach, 0) || has(reach, n));
                 let (start, margins) = (rows.start, &self.margins[range.clone()]);
-                if *kind == GroupKind::Prescribed {
-                    if let Some(unit) = unit::<E>(start, first) {
-                        add(&mut flow, &margins[0].below, unit);
-                    }
-                    if let Some(unit) = unit::<E>(n + start, first) {
-                        add(&mut flow, &margins[0].push, unit);
-                    }
+                if let (GroupKind::Prescribed, [own]) = (kind, margins) {
+                    let vectors = [&own.below, &own.push];
+                    add_moved(&mut flow, vectors, [start, n + start], first);
                     continue;
                 }
                 let increment = &mut self.increment[range.clone()];
@@ -228,13 +237,9 @@ impl Columns {
             for at in own.clone().rev() {
                 let Group { axes: range, rows: own, kind, .. } = &groups[at];
                 let (start, margins) = (own.start, &self.margins[range.clone()]);
-                if *kind == GroupKind::Prescribed {
-                    if let Some(unit) = unit::<E>(start, first) {
-                        add(&mut motion, &margins[0].above, unit);
-                    }
-                    if let Some(unit) = unit::<E>(n + start, first) {
-                        add(&mut motion, &margins[0].carry, unit);
-                    }
+                if let (GroupKind::Prescribed, [own]) = (kind, margins) {
+                    let vectors = [&own.above, &own.carry];
+                    add_moved(&mut motion, vectors, [start, n + start], first);
                     continue;
                 }
                 let group = Lowered {
@@ -508,10 +513,10 @@ impl InEights for Linearize<'_> {
     #[inline(always)]
     fn run<E: Eight>(self) -> SmallestPivot {
         let Self { recursion, columns, curvature, added, own, inertia, step, mut rows } = self;
-        recursion.generate::<E>(curvature, &step, added);
         let mut keep = Keep { columns, curvature, step, added, own };
-        let rates = |axis: usize| inertia[axis] * step.inverse.abs();
-        let pivot = recursion.eliminate::<E>(rates, &mut keep);
+        let recursion = &mut *recursion;
+        let factor = Factor { recursion: &mut *recursion, curvature, added, inertia, step };
+        let pivot = factor.watched::<E>(&mut keep);
         let recursion = &*recursion;
         for first in (0..2 * recursion.axes.len()).step_by(LANES) {
             columns.go_up::<E>(recursion, first);
@@ -533,11 +538,6 @@ impl SpatialRecursion {
     /// ```
     pub(crate) fn is_faster_by_columns(&self, entries: usize) -> bool {
         10 * entries > 31 * (self.axes.len() + self.limbs.len())
-    }
-
-    /// Room for the linearization.
-    pub(crate) fn columns(&self) -> Columns {
-        Columns::new(self.axes.len(), self.groups.len(), self.flows.len())
     }
 
     /// Factors as [`Self::factor`] does, and writes the derivatives of the increment and of the momentum by
