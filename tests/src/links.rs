@@ -60,12 +60,23 @@ impl LinkFixture {
 
     /// Options to connect.
     pub fn options(&self) -> LinkOptions {
-        LinkOptions { root: self.root(), timeout: PATIENCE, ..LinkOptions::default() }
+        patient(self.root())
     }
 
     /// A connected driver.
     pub fn connect(&self, wait: Wait) -> Result<LinkDriver, LinkError> {
         LinkDriver::connect(PLANT, LinkOptions { wait, ..self.options() })
+    }
+}
+
+/// Options of a driver that waits as long as tests do: a machine with many of them at once may stand still for longer
+/// than a controller would wait.
+pub fn patient(root: impl Into<PathBuf>) -> LinkOptions {
+    LinkOptions {
+        root: root.into(),
+        timeout: PATIENCE,
+        connect_timeout: PATIENCE,
+        ..LinkOptions::default()
     }
 }
 

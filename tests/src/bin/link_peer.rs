@@ -8,7 +8,8 @@ use std::time::Duration;
 
 use anyhow::Result;
 use clap::Parser;
-use plantd_client::link::{LinkDriver, LinkOptions};
+use plantd_client::link::LinkDriver;
+use plantd_tests::links::patient;
 
 /// Drives a plant over shared memory.
 #[derive(Parser)]
@@ -29,8 +30,7 @@ struct Arguments {
 
 fn main() -> Result<()> {
     let arguments = Arguments::parse();
-    let options = LinkOptions { root: arguments.root, ..LinkOptions::default() };
-    let mut driver = LinkDriver::connect(&arguments.plant, options)?;
+    let mut driver = LinkDriver::connect(&arguments.plant, patient(arguments.root))?;
     println!("attached");
     let dimensions = driver.dimensions();
     let mut input = vec![0.0; dimensions.inputs];

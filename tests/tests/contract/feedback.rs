@@ -1,12 +1,14 @@
 //! Feedback in a plant's own loop, and gains for whoever watches them.
 
-use plantd_client::link::{LinkDriver, LinkOptions};
+use plantd_client::link::LinkDriver;
 use plantd_client::{
     Answers, Client, Code, GainSchedule, MatrixExt as _, StateExt as _, operating_point,
     present_state, v1,
 };
 use v1::FeedbackMode as Mode;
 use v1::set_feedback_request::Reference;
+
+use plantd_tests::links::patient;
 
 use crate::support::*;
 
@@ -78,7 +80,7 @@ async fn a_law_in_the_loop_is_the_same_motion_as_one_in_the_client() {
     let directory = tempfile::Builder::new().prefix("plantd-").tempdir().unwrap();
     let root = directory.path().join("link");
     let (_server, client) = server_with(&["--link-root", root.to_str().unwrap()]).await;
-    let options = LinkOptions { root, ..LinkOptions::default() };
+    let options = patient(root);
     let gains = solved(&client).await;
     let law = GainSchedule::from_gains(gains).unwrap();
     perturbed(&client, "by-client").await;

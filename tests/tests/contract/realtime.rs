@@ -3,8 +3,9 @@
 
 use std::time::Duration;
 
-use plantd_client::link::{LinkDriver, LinkOptions};
+use plantd_client::link::LinkDriver;
 use plantd_client::{Client, Code, Error, v1};
+use plantd_tests::links::patient;
 use plantd_tests::server::ServerProcess;
 
 use crate::support::*;
@@ -360,7 +361,7 @@ async fn a_watchdog_acts_whoever_takes_the_steps() {
     let id = plant(&client, "cart-pole").await.id;
     protect(&client, &id, watchdog("x", 0.2, v1::WatchdogAction::Freeze)).await;
     let opened = client.open_link(&id).await.unwrap();
-    let options = LinkOptions { root: opened.root_path.into(), ..LinkOptions::default() };
+    let options = patient(opened.root_path);
     let mut driver = LinkDriver::connect(&id, options).unwrap();
     let error = loop {
         if let Err(error) = driver.step(&[20.0]) {

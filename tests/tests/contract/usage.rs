@@ -1,7 +1,8 @@
 //! What does not happen is said: faults that come too late, cases that are refused, watchdogs that hold.
 
-use plantd_client::link::{Guarded, LinkDriver, LinkError, LinkOptions, StepFailure};
+use plantd_client::link::{Guarded, LinkDriver, LinkError, StepFailure};
 use plantd_client::{Client, Code, RolloutExt as _, v1};
+use plantd_tests::links::patient;
 use v1::fault_spec::{Kind, Start, Target};
 
 use crate::realtime::{protect, state, watchdog};
@@ -140,7 +141,7 @@ async fn a_watchdog_names_its_quantity_its_bound_and_the_way_on() {
         let id = plant(&client, "cart-pole").await.id;
         protect(&client, &id, watchdog(quantity, max, v1::WatchdogAction::Freeze)).await;
         let opened = client.open_link(&id).await.unwrap();
-        let options = LinkOptions { root: opened.root_path.into(), ..LinkOptions::default() };
+        let options = patient(opened.root_path);
         let mut driver = LinkDriver::connect(&id, options).unwrap();
         let error = loop {
             if let Err(error) = driver.step(&[20.0]) {

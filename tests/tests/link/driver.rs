@@ -253,7 +253,7 @@ fn the_lease_of_a_killed_driver_comes_back() {
 #[test]
 fn a_link_does_not_depend_on_what_is_left_of_another_one() {
     let fixture =
-        LinkFixture::with_config("pendulum", |config| config.clean_up_period = PATIENCE / 20)
+        LinkFixture::with_config("pendulum", |config| config.clean_up_period = PATIENCE / 10)
             .unwrap();
     let mut victim = start_driver(&fixture.root(), &[]);
     victim.wait_for_line("attached").unwrap();

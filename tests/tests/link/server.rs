@@ -4,10 +4,12 @@
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use plantd_client::link::{LeaseHolder, LinkDriver, LinkError, LinkOptions, StateView};
+use plantd_client::link::{LeaseHolder, LinkDriver, LinkError, StateView};
 use plantd_client::{Client, Code, v1};
 use plantd_models::{Plant, Snapshot};
-use plantd_tests::links::{PATIENCE, files_of_links, new_plant_of_order, wait_until, wiggle};
+use plantd_tests::links::{
+    PATIENCE, files_of_links, new_plant_of_order, patient, wait_until, wiggle,
+};
 use plantd_tests::server::ServerProcess;
 
 /// Models with and without inputs, prescribed coordinates and constraints, and orders.
@@ -57,13 +59,7 @@ async fn create_plant_of_order(
 
 /// Calls of the synchronous driver leave the runtime alone.
 fn connect(plant: &str, root: &Path) -> Result<LinkDriver, LinkError> {
-    let options = LinkOptions {
-        root: root.to_owned(),
-        timeout: PATIENCE,
-        connect_timeout: PATIENCE,
-        ..LinkOptions::default()
-    };
-    tokio::task::block_in_place(|| LinkDriver::connect(plant, options))
+    tokio::task::block_in_place(|| LinkDriver::connect(plant, patient(root)))
 }
 
 type Bits = (u64, Vec<u64>);
