@@ -101,6 +101,13 @@ impl<S: Compared> TreeLu<S> {
         }
     }
 
+    /// Makes room for a matrix that had none.
+    pub fn make_room(&mut self, elimination: &SymbolicElimination) {
+        if self.upper.len() != elimination.entries() {
+            *self = Self::new(elimination);
+        }
+    }
+
     /// Sets all entries to zero; needed before filling where not every slot is written.
     pub fn clear(&mut self) {
         self.upper.fill(S::ZERO);

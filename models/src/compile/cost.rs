@@ -48,6 +48,9 @@ impl Model {
             }
             Solver::Planar => (100.0 + 340.0 * joints, 110.0 + 88.0 * joints),
             Solver::Loops => (5.0 * fronts, 41.0 * rows),
+            Solver::Spatial if self.has_fields() => {
+                (100.0 + 4300.0 * joints, 110.0 + 170.0 * joints)
+            }
             Solver::Spatial => (100.0 + 1350.0 * joints, 110.0 + 93.0 * joints),
         };
         let schur = 800.0 + 165.0 * nd * nc + 2.0 * nc.powi(3);

@@ -78,7 +78,12 @@ impl Model {
                 )
             }
             Solver::Planar | Solver::Spatial => {
-                format!("factorization by generators, {} joints, {islands}", joints.len())
+                let fields = if self.solver == Solver::Spatial && self.has_fields() {
+                    ", with what acts from the world"
+                } else {
+                    ""
+                };
+                format!("factorization by generators{fields}, {} joints, {islands}", joints.len())
             }
         });
     }

@@ -118,7 +118,8 @@ fn assemble(scene: &Scene, layout: Layout) -> Model {
     // 0.75 of the time, one of 64 a quarter.
     let is_moved = dynamics.joints.iter().any(|joint| joint.coordinate >= dynamic);
     let is_free = dimensions.constraints == 0;
-    let goes_to_space = needs_poses || (is_moved && is_free && Solver::is_deep(&elimination));
+    let goes_to_space =
+        needs_poses || (is_moved && is_free && Solver::is_deep(&elimination, false));
     let planar = if goes_to_space { None } else { planar(&dynamics, gravity) };
     let mut model = Model {
         conditioning: Conditioning::default(),

@@ -7,6 +7,7 @@ use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::Workspace;
 use crate::kkt::schur::{SchurComplement, fill_schur};
 use crate::kkt::system::{Factors, Linearized};
+use crate::lagrangian::fields::OwnTorque;
 use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::turning::Weights;
@@ -94,8 +95,23 @@ impl Workspace {
     /// What recursions need of coordinates at the last evaluation, beside the bodies.
     pub(crate) fn weigh_coordinates(&mut self, model: &Model, settings: &Settings) {
         self.mid.fill_diagonal(model, settings, &mut self.kkt.diagonal);
+        if let Some(fields) = self.kkt.fields.as_deref_mut() {
+            let weight = 2.0 * settings.force_split.at_start();
+            fields.evaluate(model, &self.mid.instant(model), weight);
+        }
         if !model.orientations.is_empty() {
             self.weigh_balls(model, settings);
+            let (h, Self { mid, kkt, .. }) = (settings.time_step_s, self);
+            let weights = &mut kkt.balls;
+            mid.for_each_own_torque(
+                model,
+                kkt.fields.as_deref(),
+                |o, OwnTorque { by_turn, by_velocity }| {
+                    let Weights { torque, column, own, .. } = &mut weights[o];
+                    let turned = by_turn.times(column).scaled(0.25 * h);
+                    *own = own.plus(&torque.times(&turned.plus(&by_velocity.scaled(0.5))));
+                },
+            );
         }
     }
 
@@ -117,6 +133,7 @@ impl Workspace {
 
     /// Fills `K` at the last evaluation.
     pub(crate) fn fill_newton_matrix(&mut self, model: &Model, settings: &Settings) {
+        self.kkt.factored.tree.make_room(&model.elimination);
         if model.potentials.couple_branches || model.forces.is_some() {
             self.kkt.factored.tree.clear();
         }

@@ -10,10 +10,13 @@ use plantd_math::tree_lu::TreeLu;
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::lagrangian::arrangement::Planar;
+use crate::lagrangian::fields::{Fields, OwnTorque};
 use crate::lagrangian::forces::Instant;
+use crate::lagrangian::kinematics::Place;
 use crate::lagrangian::mechanics::Mechanics;
+use crate::lagrangian::potentials::Potential as _;
 use crate::lagrangian::{armature, forces};
-use crate::model::mechanism::Model;
+use crate::model::mechanism::{Model, Spring};
 use crate::model::tree::JointKind;
 
 /// The midpoint of an increment `x`: `q0 + ½x`, `x/h` with `1/h` given, and the first without whole turns.
@@ -24,6 +27,34 @@ pub(crate) fn middle<S: Side>(x: S, q: S, q_low: S, per_radian: S, inverse: f64)
 }
 
 impl Midpoint {
+    /// Calls `take(orientation, torque)` for what depends on the turn and the velocity of one dynamic ball joint, beside
+    /// the bodies: its springs, and what acts on bodies from the world. It may come more than once, and adds up.
+    pub(crate) fn for_each_own_torque(
+        &self,
+        model: &Model,
+        fields: Option<&Fields>,
+        mut take: impl FnMut(usize, &OwnTorque),
+    ) {
+        let Mechanics { poses, momenta, .. } = &self.mechanics;
+        let (joints, at) =
+            (&model.dynamics.joints, Place { tree: &model.dynamics, poses, q: &self.q });
+        for spring in &model.potentials.springs {
+            if let Spring::Orientation(spring) = spring {
+                let (mut own, first) = (OwnTorque::NONE, spring.coordinate);
+                spring.for_each_second_derivative(at, &mut |i, j, value| {
+                    own.by_turn.0[j - first].0[i - first] -= value;
+                });
+                take(joints[spring.joint].orientation, &own);
+            }
+        }
+        let Some(fields) = fields else { return };
+        for (first, joint) in joints.iter().enumerate() {
+            if joint.kind == JointKind::Ball(0) && joint.coordinate < model.dimensions.dynamic {
+                take(joint.orientation, &fields.within_ball(momenta, first));
+            }
+        }
+    }
+
     /// Goes to the midpoint of an increment, with `1/h` given.
     pub(crate) fn go_to(&mut self, state: &PreciseState, increment: &[f64], inverse: f64) {
         wide!({
@@ -161,8 +192,8 @@ impl<S: Planar> Midpoint<S> {
                     *entry -= value;
                 }
             };
-            let spring = |i: usize, _, value: S| add(i, value * (0.25 * h));
-            model.for_each_spring_derivative(&self.mechanics.poses, &self.q, spring);
+            let spring = |i: usize, value: S| add(i, value * (0.25 * h));
+            model.for_each_own_spring_derivative(&self.mechanics.poses, &self.q, spring);
             for armature in &model.armature {
                 add(armature.row, S::constant(armature.inertia / h));
             }
@@ -172,7 +203,7 @@ impl<S: Planar> Midpoint<S> {
             *entry -= S::constant(a * c);
         }
         if let Some(forces) = &model.forces {
-            forces.for_each_derivative(&self.instant(model), |i, _, by_q, by_v| {
+            forces.for_each_own_derivative(&self.instant(model), |i, by_q, by_v| {
                 if let Some(entry) = diagonal.get_mut(i) {
                     *entry += (by_q * (0.5 * h) + by_v) * a;
                 }

@@ -102,21 +102,43 @@ pub(crate) struct Tangents {
     pub(crate) diagonals: Diagonals,
     /// `Σ λ D²h`.
     pub(crate) constraint_hessian: Vec<f64>,
-    /// `½h L_qq + L_qv`.
+    /// `½h L_qq + L_qv`; without room until they are needed, where generators stand for them.
     pub(crate) end_slopes: Vec<f64>,
-    /// Of joints, with ball joints.
+    /// Of joints, with ball joints; the same.
     pub(crate) flanks: Vec<Flanks>,
     /// What ball joints have of themselves.
     pub(crate) balls: Vec<OfBall>,
     pub(crate) terms: Vec<Term>,
 }
 
+impl Tangents {
+    /// Makes room for a linearization entry by entry.
+    pub(crate) fn make_room(&mut self, model: &Model) {
+        let (nd, joints) = (model.dimensions.dynamic, model.dynamics.joints.len());
+        self.end_slopes.resize(nd * nd, 0.0);
+        if !model.orientations.is_empty() {
+            self.flanks.resize(joints, Flanks::default());
+        }
+    }
+}
+
 impl Workspace {
     pub(crate) fn new(model: &Model) -> Self {
         let d = model.dimensions;
         let (nd, n, nc) = (d.dynamic, d.coordinates(), d.constraints);
-        let has_balls = !model.orientations.is_empty();
         let zeros = |len: usize| vec![0.0; len];
+        let kkt = KktSystem::new(model, spread(padded(2 * n)));
+        let mut tangents = Tangents {
+            diagonals: Diagonals::new(nd),
+            constraint_hessian: zeros(if nc > 0 { n * n } else { 0 }),
+            end_slopes: Vec::new(),
+            flanks: Vec::new(),
+            balls: vec![OfBall::ZERO; model.orientations.len()],
+            terms: Vec::with_capacity(nd.max(nc)),
+        };
+        if kkt.in_space.is_none() {
+            tangents.make_room(model);
+        }
         Self {
             response: Response::new(model),
             step: StepIncrement {
@@ -135,18 +157,8 @@ impl Workspace {
                 round_off: 0.0,
             },
             constraints: ConstraintPair { start: Closure::new(model), end: Closure::new(model) },
-            kkt: KktSystem::new(model, spread(padded(2 * n))),
-            tangents: Tangents {
-                diagonals: Diagonals::new(nd),
-                constraint_hessian: zeros(if nc > 0 { n * n } else { 0 }),
-                end_slopes: zeros(nd * nd),
-                flanks: vec![
-                    Flanks::default();
-                    if has_balls { model.dynamics.joints.len() } else { 0 }
-                ],
-                balls: vec![OfBall::ZERO; model.orientations.len()],
-                terms: Vec::with_capacity(nd.max(nc)),
-            },
+            kkt,
+            tangents,
             nudge: Nudge::new(model),
         }
     }

@@ -21,18 +21,22 @@
 //! loses digits in long chains (up to 1e-11 of it in one of 64 hinges), which the next correction makes good.
 
 pub(crate) mod columns;
+mod lines;
 #[cfg(test)]
 mod tests;
+mod vectors;
 
 use std::hint::black_box;
 use std::ops::Range;
 
 use plantd_math::eights::{Eight, InEights, in_eights};
-use plantd_math::rows::Block;
 use plantd_math::tree_lu::SmallestPivot;
 
+use crate::kkt::space::lines::{InLine, Line, Lines, combined};
+use crate::kkt::space::vectors::Vectors;
 use crate::lagrangian::curvature::Curvature;
-use crate::lagrangian::generators::{Generators, MatrixKind, Step, of_ball};
+use crate::lagrangian::fields::Fields;
+use crate::lagrangian::generators::{Generators, MatrixKind, Step};
 use crate::lagrangian::turning::Weights;
 use crate::model::mechanism::Model;
 use crate::model::tree::{JointKind, Tree};
@@ -46,6 +50,8 @@ pub(crate) struct Added<'a> {
     /// On the diagonal, but for ball joints.
     pub(crate) diagonal: &'a [f64],
     pub(crate) balls: &'a [Weights],
+    /// By what acts on bodies from the world.
+    pub(crate) fields: Option<&'a Fields>,
 }
 
 /// Axes one below the other that are eliminated at once.
@@ -88,72 +94,111 @@ struct Fork {
     is_first: bool,
 }
 
-/// The Newton matrix of a tree in space, factored.
+/// The Newton matrix of a tree in space, factored. Vectors have `B` blocks: one, or two where something acts on bodies
+/// from the world.
 #[derive(Clone, Debug)]
-pub(crate) struct SpatialRecursion {
+pub(crate) struct SpatialRecursion<const B: usize> {
     /// In the order of their elimination, as are groups.
     limbs: Vec<Limb>,
     groups: Vec<Group>,
     /// Of axes that have been eliminated, `U` and `D⁻¹ W` stand in the place of `upper` and `lower`.
-    axes: Vec<Generators>,
+    axes: Vec<Generators<Line<B>>>,
     /// `K` of each group by itself; once it is eliminated, `D⁻¹`.
     within: Vec<[[f64; WIDEST]; WIDEST]>,
     /// `A` and its transpose, by rows, where limbs meet. As trees are walked depth first, there are few, which
     /// stay in the nearest cache.
-    sums: Vec<[[Block; 8]; 2]>,
+    sums: Vec<Kept<B>>,
     /// Flows of right-hand sides, and twists that belong to solutions.
-    flows: Vec<Block>,
+    flows: Vec<Line<B>>,
+}
+
+/// `A` and its transpose in memory, by rows.
+type Kept<const B: usize> = [[[Line<B>; 8]; B]; 2];
+
+/// The recursion that a model needs.
+#[derive(Clone, Debug)]
+pub(crate) enum Spatial {
+    OfBodies(SpatialRecursion<1>),
+    WithFields(SpatialRecursion<2>),
+}
+
+impl Spatial {
+    pub(crate) fn new(model: &Model) -> Self {
+        match model.has_fields() {
+            false => Self::OfBodies(SpatialRecursion::new(model)),
+            true => Self::WithFields(SpatialRecursion::new(model)),
+        }
+    }
+
+    /// [`SpatialRecursion::factor`], with a step of this length.
+    pub(crate) fn factor(
+        &mut self,
+        model: &Model,
+        (curvature, added): (&Curvature, Added<'_>),
+        time_step_s: f64,
+        kind: MatrixKind,
+    ) -> SmallestPivot {
+        let vectors = Vectors { curvature, added, step: Step::new(time_step_s, kind) };
+        match self {
+            Self::OfBodies(recursion) => recursion.factor(model, vectors),
+            Self::WithFields(recursion) => recursion.factor(model, vectors),
+        }
+    }
+
+    /// Solves `K x = b` in place.
+    pub(crate) fn solve(&mut self, x: &mut [f64]) {
+        match self {
+            Self::OfBodies(recursion) => recursion.solve(x),
+            Self::WithFields(recursion) => recursion.solve(x),
+        }
+    }
 }
 
 /// `A` in registers.
 #[derive(Clone, Copy)]
-struct Sums<E> {
-    rows: [E; 8],
-    columns: [E; 8],
+struct Sums<E, const B: usize> {
+    rows: Lines<E, B>,
+    columns: Lines<E, B>,
 }
 
-impl<E: Eight> Sums<E> {
+impl<E: Eight, const B: usize> Sums<E, B> {
     #[inline(always)]
     fn zero() -> Self {
-        Self { rows: [E::all(0.0); 8], columns: [E::all(0.0); 8] }
+        Self { rows: [[InLine::ZERO; 8]; B], columns: [[InLine::ZERO; 8]; B] }
     }
 
     #[inline(always)]
-    fn of([rows, columns]: &[[Block; 8]; 2]) -> Self {
+    fn of([rows, columns]: &Kept<B>) -> Self {
         let mut sums = Self::zero();
-        for k in 0..8 {
-            sums.rows[k] = E::of(&rows[k]);
-            sums.columns[k] = E::of(&columns[k]);
+        for b in 0..B {
+            for k in 0..8 {
+                sums.rows[b][k] = InLine::of(&rows[b][k]);
+                sums.columns[b][k] = InLine::of(&columns[b][k]);
+            }
         }
         sums
     }
 
     #[inline(always)]
     fn plus(mut self, o: &Self) -> Self {
-        for k in 0..8 {
-            self.rows[k] = self.rows[k].plus(o.rows[k]);
-            self.columns[k] = self.columns[k].plus(o.columns[k]);
+        for b in 0..B {
+            for k in 0..8 {
+                self.rows[b][k] = self.rows[b][k].plus(o.rows[b][k]);
+                self.columns[b][k] = self.columns[b][k].plus(o.columns[b][k]);
+            }
         }
         self
     }
 
     #[inline(always)]
-    fn put(&self, [rows, columns]: &mut [[Block; 8]; 2]) {
-        for k in 0..8 {
-            self.rows[k].put(&mut rows[k]);
-            self.columns[k].put(&mut columns[k]);
+    fn put(&self, [rows, columns]: &mut Kept<B>) {
+        for b in 0..B {
+            for k in 0..8 {
+                self.rows[b][k].put(&mut rows[b][k]);
+                self.columns[b][k].put(&mut columns[b][k]);
+            }
         }
     }
-}
-
-/// The sum of eight lines, each times an entry of `v`.
-#[inline(always)]
-fn combined<E: Eight>(lines: &[E; 8], v: &Block) -> E {
-    let mut sums = [E::all(0.0); 4];
-    for (k, sum) in sums.iter_mut().enumerate() {
-        *sum = lines[k].scaled(v.0[k]).plus(lines[k + 4].scaled(v.0[k + 4]));
-    }
-    sums[0].plus(sums[2]).plus(sums[1].plus(sums[3]))
 }
 
 /// The inverse of a matrix by rows, and the pivots of its elimination from the last row to the first.
@@ -288,7 +333,7 @@ fn gather(tree: &Tree, axes: Range<usize>, nd: usize, groups: &mut Vec<Group>) {
     }
 }
 
-impl SpatialRecursion {
+impl<const B: usize> SpatialRecursion<B> {
     pub(crate) fn new(model: &Model) -> Self {
         let joints = model.dynamics.joints.len();
         let (limbs, groups, places) = limbs(&model.dynamics, model.dimensions.dynamic);
@@ -297,44 +342,36 @@ impl SpatialRecursion {
             limbs,
             groups,
             axes: vec![Generators::default(); joints],
-            sums: vec![[[Block::ZERO; 8]; 2]; places],
-            flows: vec![Block::ZERO; places],
+            sums: vec![[[[Line::ZERO; 8]; B]; 2]; places],
+            flows: vec![Line::ZERO; places],
         }
     }
 
     /// Factors the matrix that belongs to the last second derivatives; dynamic joints are in the order of their
     /// coordinates. Each pivot is compared with the larger of its diagonal entry
-    /// and the inertia of its row over the step. Of masses alone it is `−M/h`. About 600 flops an axis.
+    /// and the inertia of its row over the step. Of masses alone it is `−M/h`. About 600 flops an axis, or 2000 with
+    /// two blocks.
     #[inline(never)]
-    pub(crate) fn factor(
-        &mut self,
-        model: &Model,
-        curvature: &Curvature,
-        added: Added<'_>,
-        step: f64,
-        kind: MatrixKind,
-    ) -> SmallestPivot {
-        let (step, inertia) = (Step::new(step, kind), &model.conditioning.inertia[..]);
-        in_eights(Factor { recursion: self, curvature, added, inertia, step })
+    fn factor(&mut self, model: &Model, vectors: Vectors<'_>) -> SmallestPivot {
+        let inertia = &model.conditioning.inertia[..];
+        in_eights(Factor { recursion: self, vectors, inertia })
     }
 
-    /// Solves `K x = b` in place, about 65 flops an axis.
+    /// Solves `K x = b` in place, about 65 flops an axis for each block.
     #[inline(never)]
-    pub(crate) fn solve(&mut self, x: &mut [f64]) {
+    fn solve(&mut self, x: &mut [f64]) {
         in_eights(Solve { recursion: self, x });
     }
 }
 
 /// An elimination.
-struct Factor<'a> {
-    recursion: &'a mut SpatialRecursion,
-    curvature: &'a Curvature,
-    added: Added<'a>,
+struct Factor<'a, const B: usize> {
+    recursion: &'a mut SpatialRecursion<B>,
+    vectors: Vectors<'a>,
     inertia: &'a [f64],
-    step: Step,
 }
 
-impl InEights for Factor<'_> {
+impl<const B: usize> InEights for Factor<'_, B> {
     type Output = SmallestPivot;
 
     #[inline(always)]
@@ -343,41 +380,59 @@ impl InEights for Factor<'_> {
     }
 }
 
-impl Factor<'_> {
+impl<const B: usize> Factor<'_, B> {
     #[inline(always)]
-    fn watched<E: Eight>(self, watch: &mut impl Watch<E>) -> SmallestPivot {
-        let Self { recursion, curvature, added, inertia, step } = self;
-        recursion.generate::<E>(curvature, &step, added);
-        recursion.eliminate::<E>(|axis| inertia[axis] * step.inverse.abs(), watch)
+    fn watched<E: Eight>(self, watch: &mut impl Watch<E, B>) -> SmallestPivot {
+        let Self { recursion, vectors, inertia } = self;
+        recursion.generate::<E>(&vectors);
+        let inverse = vectors.step.inverse.abs();
+        recursion.eliminate::<E>(|axis| inertia[axis] * inverse, watch)
     }
 }
 
 /// Looks at groups before they are eliminated.
-trait Watch<E> {
+trait Watch<E, const B: usize> {
     /// At the generators of a group, and at `A` where it is not zero.
-    fn see(&mut self, at: usize, group: &Group, axes: &[Generators], sums: Option<&Sums<E>>);
+    fn see(
+        &mut self,
+        at: usize,
+        group: &Group,
+        axes: &[Generators<Line<B>>],
+        sums: Option<&Sums<E, B>>,
+    );
 }
 
 /// Nobody looks.
-impl<E> Watch<E> for () {
+impl<E, const B: usize> Watch<E, B> for () {
     #[inline(always)]
-    fn see(&mut self, _: usize, _: &Group, _: &[Generators], _: Option<&Sums<E>>) {}
+    fn see(&mut self, _: usize, _: &Group, _: &[Generators<Line<B>>], _: Option<&Sums<E, B>>) {}
 }
 
-impl SpatialRecursion {
+impl<E: Eight, const B: usize> Generators<InLine<E, B>> {
+    /// To memory.
+    #[inline(always)]
+    fn put_lines(self, to: &mut Generators<Line<B>>) {
+        self.minus.put(&mut to.minus);
+        self.plus.put(&mut to.plus);
+        self.upper.put(&mut to.upper);
+        self.lower.put(&mut to.lower);
+    }
+}
+
+impl<const B: usize> SpatialRecursion<B> {
     /// Writes the vectors of all axes, and `K` of each group.
     #[inline(always)]
-    fn generate<E: Eight>(&mut self, curvature: &Curvature, step: &Step, added: Added<'_>) {
+    fn generate<E: Eight>(&mut self, vectors: &Vectors<'_>) {
+        let added = &vectors.added;
         for (group, within) in self.groups.iter().zip(&mut self.within) {
             let (range, first) = (group.axes.clone(), group.axes.start);
             let axes = &mut self.axes[range.clone()];
             match group.kind {
                 GroupKind::Single => {}
                 GroupKind::Ball(ball) => {
-                    let parts = step.parts_of_ball::<E>(curvature, first);
-                    let (generators, own) = of_ball(&parts, &added.balls[ball]);
+                    let (generators, own) = vectors.ball::<E, B>(first, &added.balls[ball]);
                     for (axis, own) in axes.iter_mut().zip(generators) {
-                        own.put(axis);
+                        own.put_lines(axis);
                     }
                     *within = own;
                     continue;
@@ -385,13 +440,13 @@ impl SpatialRecursion {
                 GroupKind::Prescribed => continue,
             }
             for (i, axis) in range.zip(&mut *axes) {
-                step.parts::<E>(curvature, i).generators().put(axis);
+                vectors.single::<E, B>(i).put_lines(axis);
             }
             let diagonal = &added.diagonal[group.rows.clone()];
             match *axes {
-                [ref a] => write_within::<E, 1>([a], diagonal, within),
-                [ref a, ref b] => write_within::<E, 2>([a, b], diagonal, within),
-                [ref a, ref b, ref c] => write_within::<E, 3>([a, b, c], diagonal, within),
+                [ref a] => write_within::<E, B, 1>([a], diagonal, within),
+                [ref a, ref b] => write_within::<E, B, 2>([a, b], diagonal, within),
+                [ref a, ref b, ref c] => write_within::<E, B, 3>([a, b, c], diagonal, within),
                 _ => {}
             }
         }
@@ -402,12 +457,12 @@ impl SpatialRecursion {
     fn eliminate<E: Eight>(
         &mut self,
         inertia: impl Fn(usize) -> f64,
-        watch: &mut impl Watch<E>,
+        watch: &mut impl Watch<E, B>,
     ) -> SmallestPivot {
         let mut smallest = SmallestPivot::NONE;
         for limb in &self.limbs {
             let mut sums = match limb.carries {
-                Some(place) => Sums::<E>::of(&self.sums[place]),
+                Some(place) => Sums::<E, B>::of(&self.sums[place]),
                 None => Sums::zero(),
             };
             let mut carries = limb.carries.is_some();
@@ -444,37 +499,37 @@ impl SpatialRecursion {
 
 /// `K` of hinges, slides and screws one below the other.
 #[inline(always)]
-fn write_within<E: Eight, const W: usize>(
-    axes: [&Generators; W],
+fn write_within<E: Eight, const B: usize, const W: usize>(
+    axes: [&Generators<Line<B>>; W],
     diagonal: &[f64],
     within: &mut [[f64; WIDEST]; WIDEST],
 ) {
     for (a, above) in axes.iter().enumerate() {
-        let (minus, plus) = (E::of(&above.minus), E::of(&above.plus));
-        within[a][a] = minus.dot(E::of(&above.upper)) + diagonal[a];
+        let (minus, plus) = (InLine::<E, B>::of(&above.minus), InLine::<E, B>::of(&above.plus));
+        within[a][a] = minus.dot(InLine::of(&above.upper)) + diagonal[a];
         for (b, below) in axes.iter().enumerate().skip(a + 1) {
-            within[a][b] = minus.dot(E::of(&below.upper));
-            within[b][a] = plus.dot(E::of(&below.lower));
+            within[a][b] = minus.dot(InLine::of(&below.upper));
+            within[b][a] = plus.dot(InLine::of(&below.lower));
         }
     }
 }
 
 /// Eliminates the axes of a group; `see` takes an axis, its pivot, and what stands in `K` in its place.
 #[inline(always)]
-fn eliminate<E: Eight, const W: usize>(
-    axes: [&mut Generators; W],
+fn eliminate<E: Eight, const B: usize, const W: usize>(
+    axes: [&mut Generators<Line<B>>; W],
     within: &mut [[f64; WIDEST]; WIDEST],
-    sums: &mut Sums<E>,
+    sums: &mut Sums<E, B>,
     carries: bool,
     is_root: bool,
     mut see: impl FnMut(usize, f64, f64),
 ) {
     let mut d = [[0.0; W]; W];
-    let [mut u, mut w] = [[E::all(0.0); W]; 2];
+    let [mut u, mut w] = [[InLine::<E, B>::ZERO; W]; 2];
     for a in 0..W {
         d[a].copy_from_slice(&within[a][..W]);
-        u[a] = E::of(&axes[a].upper);
-        w[a] = E::of(&axes[a].lower);
+        u[a] = InLine::of(&axes[a].upper);
+        w[a] = InLine::of(&axes[a].lower);
     }
     if carries {
         for b in 0..W {
@@ -482,7 +537,7 @@ fn eliminate<E: Eight, const W: usize>(
             u[b] = u[b].plus(product);
             w[b] = w[b].plus(combined(&sums.rows, &axes[b].minus));
             for (row, axis) in d.iter_mut().zip(&axes) {
-                row[b] += E::of(&axis.minus).dot(product);
+                row[b] += InLine::of(&axis.minus).dot(product);
             }
         }
     }
@@ -490,7 +545,7 @@ fn eliminate<E: Eight, const W: usize>(
     for a in (0..W).rev() {
         see(a, pivots[a], within[a][a]);
     }
-    let mut w_over_d = [E::all(0.0); W];
+    let mut w_over_d = [InLine::<E, B>::ZERO; W];
     for a in 0..W {
         w_over_d[a] = w[0].scaled(inverse[a][0]);
         for b in 1..W {
@@ -505,21 +560,24 @@ fn eliminate<E: Eight, const W: usize>(
     }
     for a in 0..W {
         // Number by number from memory, where compilers would take the registers apart.
-        let axis: &Generators = black_box(&*axes[a]);
-        for k in 0..8 {
-            sums.rows[k] = sums.rows[k].minus(w_over_d[a].scaled(axis.upper.0[k]));
-            sums.columns[k] = sums.columns[k].minus(u[a].scaled(axis.lower.0[k]));
+        let axis: &Generators<Line<B>> = black_box(&*axes[a]);
+        for b in 0..B {
+            let (rows, columns) = (&mut sums.rows[b], &mut sums.columns[b]);
+            for k in 0..8 {
+                rows[k] = rows[k].minus(w_over_d[a].scaled(axis.upper.0[b].0[k]));
+                columns[k] = columns[k].minus(u[a].scaled(axis.lower.0[b].0[k]));
+            }
         }
     }
 }
 
 /// A solution.
-struct Solve<'a> {
-    recursion: &'a mut SpatialRecursion,
+struct Solve<'a, const B: usize> {
+    recursion: &'a mut SpatialRecursion<B>,
     x: &'a mut [f64],
 }
 
-impl InEights for Solve<'_> {
+impl<const B: usize> InEights for Solve<'_, B> {
     type Output = ();
 
     #[inline(always)]
@@ -528,8 +586,8 @@ impl InEights for Solve<'_> {
         let SpatialRecursion { limbs, groups, axes, within, flows, .. } = recursion;
         for limb in &*limbs {
             let mut flow = match limb.carries {
-                Some(place) => E::of(&flows[place]),
-                None => E::all(0.0),
+                Some(place) => InLine::<E, B>::of(&flows[place]),
+                None => InLine::ZERO,
             };
             for at in limb.groups.clone() {
                 let Group { axes: range, rows, kind, .. } = &groups[at];
@@ -546,14 +604,14 @@ impl InEights for Solve<'_> {
             }
             if let Some(Fork { place, is_first }) = limb.hangs_from {
                 let all = &mut flows[place];
-                let flow = if is_first { flow } else { flow.plus(E::of(all)) };
+                let flow = if is_first { flow } else { flow.plus(InLine::of(all)) };
                 flow.put(all);
             }
         }
         for limb in limbs.iter().rev() {
             let mut flow = match limb.hangs_from {
-                Some(fork) => E::of(&flows[fork.place]),
-                None => E::all(0.0),
+                Some(fork) => InLine::<E, B>::of(&flows[fork.place]),
+                None => InLine::ZERO,
             };
             for at in limb.groups.clone().rev() {
                 let Group { axes: range, rows, kind, .. } = &groups[at];
@@ -576,15 +634,15 @@ impl InEights for Solve<'_> {
 
 /// Eliminates the right-hand sides of a group: the flow above it, from the one below.
 #[inline(always)]
-fn lift<E: Eight, const W: usize>(
-    axes: [&Generators; W],
+fn lift<E: Eight, const B: usize, const W: usize>(
+    axes: [&Generators<Line<B>>; W],
     x: [&mut f64; W],
     inverse: &[[f64; WIDEST]; WIDEST],
-    flow: E,
-) -> E {
+    flow: InLine<E, B>,
+) -> InLine<E, B> {
     let mut b = [0.0; W];
     for a in 0..W {
-        b[a] = *x[a] - E::of(&axes[a].minus).dot(flow);
+        b[a] = *x[a] - InLine::of(&axes[a].minus).dot(flow);
     }
     let mut next = flow;
     for a in 0..W {
@@ -593,18 +651,22 @@ fn lift<E: Eight, const W: usize>(
             value += inverse[a][c] * b[c];
         }
         *x[a] = value;
-        next = next.plus(E::of(&axes[a].upper).scaled(value));
+        next = next.plus(InLine::of(&axes[a].upper).scaled(value));
     }
     next
 }
 
 /// The solution of a group and the flow below it, from the one above.
 #[inline(always)]
-fn lower<E: Eight, const W: usize>(axes: [&Generators; W], x: [&mut f64; W], flow: E) -> E {
+fn lower<E: Eight, const B: usize, const W: usize>(
+    axes: [&Generators<Line<B>>; W],
+    x: [&mut f64; W],
+    flow: InLine<E, B>,
+) -> InLine<E, B> {
     let mut next = flow;
     for (x, axis) in x.into_iter().zip(axes) {
-        *x -= E::of(&axis.lower).dot(flow);
-        next = next.plus(E::of(&axis.plus).scaled(*x));
+        *x -= InLine::of(&axis.lower).dot(flow);
+        next = next.plus(InLine::of(&axis.plus).scaled(*x));
     }
     next
 }

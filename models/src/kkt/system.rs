@@ -15,9 +15,10 @@ use crate::kkt::held::HeldLimbs;
 use crate::kkt::loops::{Mechanism, Multifrontal, Scales};
 use crate::kkt::planar::PlanarRecursion;
 use crate::kkt::schur::SchurComplement;
-use crate::kkt::space::columns::{Columns, Own, Rows};
-use crate::kkt::space::{Added, SpatialRecursion};
-use crate::lagrangian::generators::{MatrixKind, Step};
+use crate::kkt::space::columns::{InSpace, Own, Rows};
+use crate::kkt::space::{Added, Spatial};
+use crate::lagrangian::fields::Fields;
+use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::planar::PlanarTree;
 use crate::lagrangian::turning::Weights;
@@ -36,6 +37,8 @@ pub(crate) struct KktSystem {
     /// How ball joints weigh their rows and columns.
     pub(crate) balls: Vec<Weights>,
     pub(crate) estimates: Estimates,
+    /// What acts on bodies from the world, where generators have that.
+    pub(crate) fields: Option<Box<Fields>>,
     /// For linearizations by generators in space.
     pub(crate) in_space: Option<Box<InSpace>>,
 }
@@ -43,7 +46,7 @@ pub(crate) struct KktSystem {
 /// Factors of `K`.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Factored {
-    /// Entry by entry.
+    /// Entry by entry; without room until it is filled, where generators stand for it.
     pub(crate) tree: TreeLu,
     pub(crate) recursion: Recursion,
     /// Which of them were factored last.
@@ -58,23 +61,9 @@ pub(crate) enum Recursion {
     Planar(Box<PlanarRecursion>),
     /// With the constraints.
     Loops(Box<Multifrontal>),
-    Spatial(Box<SpatialRecursion>),
+    Spatial(Box<Spatial>),
     /// Limbs with the constraints, and the tree LU of what they leave.
     Held(Box<HeldLimbs>),
-}
-
-/// A linearization by generators in space, whatever steps are solved by.
-#[derive(Clone, Debug)]
-pub(crate) struct InSpace {
-    recursion: SpatialRecursion,
-    columns: Columns,
-}
-
-impl InSpace {
-    pub(crate) fn new(model: &Model) -> Self {
-        let recursion = SpatialRecursion::new(model);
-        Self { columns: Columns::new(&recursion), recursion }
-    }
 }
 
 /// Which factors are valid.
@@ -118,13 +107,15 @@ impl Factored {
                 Some(held) => Recursion::Held(Box::new(HeldLimbs::new(held))),
                 None => Recursion::None,
             },
-            (Solver::Spatial, _) => {
-                let recursion = SpatialRecursion::new(model);
-                Recursion::Spatial(Box::new(recursion))
-            }
+            (Solver::Spatial, _) => Recursion::Spatial(Box::new(Spatial::new(model))),
             (Solver::Tree | Solver::Loops, _) => Recursion::None,
         };
-        Self { tree: TreeLu::new(&model.elimination), recursion, valid: Factors::Tree }
+        // Long chains have many entries, and seldom need them.
+        let tree = match model.solver {
+            Solver::Spatial => TreeLu::default(),
+            _ => TreeLu::new(&model.elimination),
+        };
+        Self { tree, recursion, valid: Factors::Tree }
     }
 }
 
@@ -135,11 +126,14 @@ impl KktSystem {
         let entries = model.elimination.entries();
         let in_space = (model.is_generated_in_space())
             .then(|| InSpace::new(model))
-            .filter(|own| own.recursion.is_faster_by_columns(entries))
+            .filter(|own| own.is_faster(entries))
             .map(Box::new);
+        let is_generated = in_space.is_some() || model.solver == Solver::Spatial;
+        let fields = (is_generated && model.has_fields()).then(|| Box::new(Fields::new(model)));
         Self {
             factored: Factored::new(model),
             in_space,
+            fields,
             schur: SchurComplement::new(model, stride),
             diagonal: vec![0.0; nd],
             balls: vec![Weights::REST; model.orientations.len()],
@@ -212,9 +206,9 @@ impl KktSystem {
             }
             (Recursion::Spatial(recursion), ..) => {
                 mechanics.differentiate(model);
-                let added = Added { diagonal, balls: &self.balls };
-                let curvature = &mechanics.curvature;
-                recursion.factor(model, curvature, added, time_step_s, kind)
+                let fields = self.fields.as_deref().filter(|_| kind == MatrixKind::Newton);
+                let added = Added { diagonal, balls: &self.balls, fields };
+                recursion.factor(model, (&mechanics.curvature, added), time_step_s, kind)
             }
             (Recursion::None | Recursion::Planar(_) | Recursion::Loops(_), ..) => {
                 return Ok(false);
@@ -236,15 +230,13 @@ impl KktSystem {
         own: Own<'_>,
         rows: Rows<'_>,
     ) -> Result<bool, SmallestPivot> {
-        let Some(InSpace { recursion, columns }) = self.in_space.as_deref_mut() else {
-            return Ok(false);
-        };
+        let Some(in_space) = &mut self.in_space else { return Ok(false) };
         let Linearized { model, mechanics, time_step_s, singular_below, .. } = at;
-        let added = Added { diagonal: &self.diagonal, balls: &self.balls };
-        let step = (&model.conditioning.inertia[..], Step::new(time_step_s, MatrixKind::Newton));
+        let (diagonal, balls) = (&self.diagonal[..], &self.balls[..]);
+        let added = Added { diagonal, balls, fields: self.fields.as_deref() };
         self.factored.valid = Factors::Stale;
-        let curvature = &mechanics.curvature;
-        let pivot = recursion.linearize(columns, curvature, (added, own), step, rows);
+        let step = (&model.conditioning.inertia[..], time_step_s);
+        let pivot = in_space.linearize((&mechanics.curvature, added), own, step, rows);
         self.judge(pivot, singular_below).map(|()| true)
     }
 

@@ -114,6 +114,17 @@ impl Forces {
         for_each_force!(self, element => element.add(at, force));
     }
 
+    /// Calls `entry(i, ∂f_i/∂q_i, ∂f_i/∂v_i)` for the forces on single coordinates.
+    pub(crate) fn for_each_own_derivative<S: Scalar>(
+        &self,
+        at: &Instant<'_, S>,
+        mut entry: impl FnMut(usize, S, S),
+    ) {
+        for force in &self.coordinate_forces {
+            force.for_each_derivative(at, &mut |i, _, by_q, by_v| entry(i, by_q, by_v));
+        }
+    }
+
     /// [`GeneralizedForce::for_each_derivative`] of each force.
     #[inline(never)]
     pub(crate) fn for_each_derivative<S: Scalar>(

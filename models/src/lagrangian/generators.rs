@@ -60,9 +60,9 @@ pub(crate) enum MatrixKind {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Step {
     /// ½, or 0 for masses alone.
-    motion: f64,
+    pub(crate) motion: f64,
     /// `½h`, or 0.
-    half: f64,
+    pub(crate) half: f64,
     /// `1/h`.
     pub(crate) inverse: f64,
 }
@@ -92,7 +92,7 @@ fn sum<E: Eight>([a, b, c]: &[E; 3], weights: [f64; 3]) -> E {
 
 /// `m` times three vectors, one below the other.
 #[inline(always)]
-fn rows<E: Eight>(m: &Mat3, vectors: &[E; 3]) -> [E; 3] {
+pub(crate) fn rows<E: Eight>(m: &Mat3, vectors: &[E; 3]) -> [E; 3] {
     let Mat3([x, y, z]) = m;
     let mut out = *vectors;
     for (a, out) in out.iter_mut().enumerate() {

@@ -9,6 +9,7 @@ pub(crate) mod arrangement;
 pub(crate) mod curvature;
 pub(crate) mod derivatives;
 pub(crate) mod energy;
+pub(crate) mod fields;
 pub(crate) mod forces;
 pub(crate) mod generators;
 pub(crate) mod kinematics;

@@ -89,6 +89,26 @@ impl Model {
         self.potentials.springs.iter().fold(S::ZERO, |sum, spring| sum + energy(spring))
     }
 
+    /// Calls `entry(i, V_ii)` for the springs of single coordinates.
+    pub(crate) fn for_each_own_spring_derivative<S: Scalar>(
+        &self,
+        poses: &Poses<S>,
+        q: &[S],
+        mut entry: impl FnMut(usize, S),
+    ) {
+        let at = Place { tree: &self.dynamics, poses, q };
+        let mut take = |i: usize, _: usize, value: S| entry(i, value);
+        for spring in &self.potentials.springs {
+            match spring {
+                Spring::Point(_) | Spring::Path(_) | Spring::Orientation(_) => {}
+                Spring::Coordinate(own) => own.for_each_second_derivative(at, &mut take),
+                Spring::Spline(own) => own.for_each_second_derivative(at, &mut take),
+                Spring::Linear(own) => own.for_each_second_derivative(at, &mut take),
+                Spring::Stop(own) => own.for_each_second_derivative(at, &mut take),
+            }
+        }
+    }
+
     /// [`Potential::for_each_second_derivative`] of each spring.
     pub(crate) fn for_each_spring_derivative<S: Scalar>(
         &self,

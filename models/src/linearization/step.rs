@@ -6,7 +6,7 @@ use plantd_math::spatial::three;
 
 use crate::integrator::matrix::linearized;
 use crate::integrator::report::StepError;
-use crate::integrator::settings::Settings;
+use crate::integrator::settings::{ForceSplit, Settings};
 use crate::integrator::workspace::{StepContext, Tangents, Workspace};
 use crate::kkt::loops;
 use crate::kkt::planar::Diagonals;
@@ -93,14 +93,16 @@ impl Workspace {
         Ok(true)
     }
 
-    /// Linearizes in O(n²), for trees in space without constraints, springs between points, and forces.
+    /// Linearizes in O(n²), for trees in space without constraints and what acts between bodies.
     fn linearize_space(
         &mut self,
         at: StepContext<'_>,
         out: &mut Linearization,
     ) -> Result<bool, StepError> {
         let StepContext { model, settings, .. } = at;
-        if self.kkt.in_space.is_none() {
+        // Generators of forces at poses are those of equal halves.
+        let is_split = settings.force_split == ForceSplit::Paper && model.forces.is_some();
+        if self.kkt.in_space.is_none() || (self.kkt.fields.is_some() && is_split) {
             return Ok(false);
         }
         self.weigh_coordinates(model, settings);
@@ -109,8 +111,13 @@ impl Workspace {
         out.turnings.clear();
         if model.orientations.is_empty() {
             fill_inputs(at, out);
+            self.fill_inputs_of_forces(at, out);
         } else {
             self.find_turnings(at, out);
+            let Self { mid, kkt, tangents, .. } = self;
+            mid.for_each_own_torque(model, kkt.fields.as_deref(), |o, own| {
+                tangents.balls[o].add_torque(&out.turnings[o], own, out.time_step_s);
+            });
             self.fill_turned_inputs(model, out);
         }
         let Self { mid, kkt, constraints, tangents, .. } = self;
@@ -134,7 +141,7 @@ impl Workspace {
         by_increment.fill(0.0);
         if model.potentials.any {
             let poses = &mid.mechanics.poses;
-            model.for_each_spring_derivative(poses, &mid.q, |i, _, value| {
+            model.for_each_own_spring_derivative(poses, &mid.q, |i, value| {
                 if i < nd {
                     residual[i] -= 0.5 * h * value;
                     by_start[i] -= h * value;
@@ -146,7 +153,7 @@ impl Workspace {
             *slope -= c;
         }
         if let Some(forces) = &model.forces {
-            forces.for_each_derivative(&mid.instant(model), |i, _, by_q, by_v| {
+            forces.for_each_own_derivative(&mid.instant(model), |i, by_q, by_v| {
                 if i < nd {
                     residual[i] += a * h * by_q;
                     by_start[i] += h * by_q;
@@ -227,6 +234,7 @@ impl Workspace {
 
     /// Writes `r1'` into `out.increment` and starts `out.momentum` with what does not depend on `x'`.
     pub(crate) fn fill_right_hand_sides(&mut self, at: StepContext<'_>, out: &mut Linearization) {
+        self.tangents.make_room(at.model);
         wide!({
             let model = at.model;
             let h = at.settings.time_step_s;
@@ -368,8 +376,15 @@ impl Workspace {
                 }
             }
         });
+        self.fill_inputs_of_forces(at, out);
+    }
+
+    /// What unit inputs give by forces.
+    fn fill_inputs_of_forces(&self, at: StepContext<'_>, out: &mut Linearization) {
+        let Some(forces) = &at.model.forces else { return };
+        let (h, nd, a) = (at.settings.time_step_s, out.nd, out.at_start);
         let mut places = out.inputs[at.model.coordinate_inputs.len()..].iter_mut();
-        forces.for_each_input_derivative(&instant, |row, _, by_u| {
+        forces.for_each_input_derivative(&self.mid.instant(at.model), |row, _, by_u| {
             let place = if row < nd { places.next() } else { None };
             if let Some(place) = place {
                 (place.residual, place.momentum) = (a * h * by_u, h * by_u);

@@ -22,6 +22,7 @@ use crate::integrator::balls::BallJoints;
 use crate::integrator::workspace::{StepContext, Tangents, Workspace};
 use crate::kkt::space::columns::OfBall;
 use crate::lagrangian::curvature::Within;
+use crate::lagrangian::fields::OwnTorque;
 use crate::lagrangian::generators::{Flanks, Parts};
 use crate::lagrangian::turning::Turning;
 use crate::linearization::linearize::Linearization;
@@ -176,6 +177,17 @@ impl OfBall {
         let momentum = tau_v.transpose().times(middle).plus(&m_v.scaled(1.0 / h));
         let by_increment = torque.scaled(h).plus(&spin.times(&momentum)).plus(turned);
         Self { residual, by_start, by_increment }
+    }
+
+    /// A torque that follows from its own turn and velocity.
+    pub(crate) fn add_torque(&mut self, turning: &Turning, torque: &OwnTorque, h: f64) {
+        let OwnTorque { by_turn, by_velocity } = torque;
+        let (start, middle) = (&turning.by_start.0, &turning.by_next.0);
+        let by_start = by_turn.times(start).scaled(h);
+        self.residual = self.residual.plus(&turning.torque.times(&by_start.scaled(0.5)));
+        self.by_start = self.by_start.plus(&by_start);
+        let by_increment = by_turn.times(middle).scaled(h).plus(by_velocity);
+        self.by_increment = self.by_increment.plus(&by_increment);
     }
 
     /// Dampers and armatures of its coordinates, which change with the velocity `ξ/h` alone.

@@ -378,6 +378,7 @@ impl Workspace {
             &self.mid.mechanics.poses,
             &self.mid.mechanics.momenta,
         );
+        self.kkt.factored.tree.make_room(&model.elimination);
         self.kkt.factored.tree.clear();
         self.mid.mechanics.curvature.fill_mass_matrix(&model.pairs, &mut self.kkt.factored.tree);
         for entry in &model.armature {

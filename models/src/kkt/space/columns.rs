@@ -33,27 +33,18 @@ use plantd_math::spatial::Mat3;
 use plantd_math::tree_lu::SmallestPivot;
 
 use crate::kkt::planar::Diagonals;
+use crate::kkt::space::lines::{InLine, Line, combined};
+use crate::kkt::space::vectors::{Margin, Vectors};
 use crate::kkt::space::{
-    Added, Factor, Fork, Group, GroupKind, Limb, SpatialRecursion, Sums, WIDEST, Watch, combined,
+    Added, Factor, Fork, Group, GroupKind, Limb, SpatialRecursion, Sums, WIDEST, Watch,
 };
 use crate::lagrangian::curvature::Curvature;
-use crate::lagrangian::generators::{Flanks, Generators, Step};
+use crate::lagrangian::generators::{Generators, MatrixKind, Step};
 use crate::lagrangian::turning::Turning;
+use crate::model::mechanism::Model;
 
 /// A matrix of the axes of a group, by rows.
 type Square = [[f64; WIDEST]; WIDEST];
-
-/// What an axis gives to the derivatives of a step beside its generators. Of an axis whose motion is prescribed, and
-/// which has no rows, `carry` and `push` are what `above` and `below` are, by its next position.
-#[derive(Clone, Copy, Debug, Default)]
-struct Margin {
-    carry: Block,
-    /// `push + Aᵀ carry`.
-    push: Block,
-    above: Block,
-    /// `below + A above`.
-    below: Block,
-}
 
 /// What the axes of a group have among themselves, with what is below them.
 #[derive(Clone, Copy, Debug, Default)]
@@ -96,12 +87,12 @@ pub(crate) struct Rows<'a> {
 
 /// Eight columns of the derivatives, and what finds them.
 #[derive(Clone, Debug)]
-pub(crate) struct Columns {
-    margins: Vec<Margin>,
+pub(crate) struct Columns<const B: usize> {
+    margins: Vec<Margin<Line<B>>>,
     among: Vec<Among>,
     /// `F̂` where limbs meet, zero but within a pass, and `T` there.
-    flows: Vec<[Block; 8]>,
-    motions: Vec<[Block; 8]>,
+    flows: Vec<[[Block; 8]; B]>,
+    motions: Vec<[[Block; 8]; B]>,
     increment: Vec<Block>,
     momentum: Vec<Block>,
 }
@@ -112,25 +103,41 @@ fn unit<E: Eight>(column: usize, first: usize) -> Option<E> {
     UNITS.get(column.wrapping_sub(first)).map(|unit| E::of(unit))
 }
 
+/// What flows through a joint: for each number of a vector, that of each column.
+type Flow<E, const B: usize> = [[E; 8]; B];
+
 /// The product of a vector with each column.
 #[inline(always)]
-fn product<E: Eight>(Block([a, b, c, d, e, f, g, h]): &Block, flow: &[E; 8]) -> E {
-    let [p, q, r, s, t, u, v, w] = flow;
-    let one = p.scaled(*a).plus(q.scaled(*b)).plus(r.scaled(*c).plus(s.scaled(*d)));
-    one.plus(t.scaled(*e).plus(u.scaled(*f)).plus(v.scaled(*g).plus(w.scaled(*h))))
+fn product<E: Eight, const B: usize>(line: &Line<B>, flow: &Flow<E, B>) -> E {
+    let mut sum = E::ZERO;
+    for (at, (block, flow)) in line.0.iter().zip(flow).enumerate() {
+        let Block([a, b, c, d, e, f, g, h]) = block;
+        let [p, q, r, s, t, u, v, w] = flow;
+        let one = p.scaled(*a).plus(q.scaled(*b)).plus(r.scaled(*c).plus(s.scaled(*d)));
+        let own = one.plus(t.scaled(*e).plus(u.scaled(*f)).plus(v.scaled(*g).plus(w.scaled(*h))));
+        sum = if at == 0 { own } else { sum.plus(own) };
+    }
+    sum
 }
 
 /// Adds a vector, times a number for each column.
 #[inline(always)]
-fn add<E: Eight>(flow: &mut [E; 8], vector: &Block, times: E) {
-    for (own, entry) in flow.iter_mut().zip(&vector.0) {
-        *own = own.plus(times.scaled(*entry));
+fn add<E: Eight, const B: usize>(flow: &mut Flow<E, B>, line: &Line<B>, times: E) {
+    for (flow, block) in flow.iter_mut().zip(&line.0) {
+        for (own, entry) in flow.iter_mut().zip(&block.0) {
+            *own = own.plus(times.scaled(*entry));
+        }
     }
 }
 
 /// Adds what a joint that is moved gives to its two columns.
 #[inline(always)]
-fn add_moved<E: Eight>(flow: &mut [E; 8], vectors: [&Block; 2], columns: [usize; 2], first: usize) {
+fn add_moved<E: Eight, const B: usize>(
+    flow: &mut Flow<E, B>,
+    vectors: [&Line<B>; 2],
+    columns: [usize; 2],
+    first: usize,
+) {
     for (vector, column) in vectors.into_iter().zip(columns) {
         if let Some(unit) = unit::<E>(column, first) {
             add(flow, vector, unit);
@@ -139,24 +146,26 @@ fn add_moved<E: Eight>(flow: &mut [E; 8], vectors: [&Block; 2], columns: [usize;
 }
 
 #[inline(always)]
-fn of_blocks<E: Eight>(blocks: &[Block; 8]) -> [E; 8] {
-    let mut all = [E::ZERO; 8];
-    for (own, block) in all.iter_mut().zip(blocks) {
-        *own = E::of(block);
+fn of_blocks<E: Eight, const B: usize>(blocks: &Flow<Block, B>) -> Flow<E, B> {
+    let mut all = [[E::ZERO; 8]; B];
+    for (all, blocks) in all.iter_mut().zip(blocks) {
+        for (own, block) in all.iter_mut().zip(blocks) {
+            *own = E::of(block);
+        }
     }
     all
 }
 
-impl Columns {
+impl<const B: usize> Columns<B> {
     /// Room for a linearization by a recursion.
-    pub(crate) fn new(recursion: &SpatialRecursion) -> Self {
+    pub(crate) fn new(recursion: &SpatialRecursion<B>) -> Self {
         let SpatialRecursion { axes, groups, flows, .. } = recursion;
         let (joints, places) = (axes.len(), flows.len());
         Self {
             margins: vec![Margin::default(); joints],
             among: vec![Among::default(); groups.len()],
-            flows: vec![[Block::ZERO; 8]; places],
-            motions: vec![[Block::ZERO; 8]; places],
+            flows: vec![[[Block::ZERO; 8]; B]; places],
+            motions: vec![[[Block::ZERO; 8]; B]; places],
             increment: vec![Block::ZERO; joints],
             momentum: vec![Block::ZERO; joints],
         }
@@ -164,7 +173,7 @@ impl Columns {
 
     /// From the joints of the columns to the root: `F̂`, `x̂`, and what they give to the momentum.
     #[inline(always)]
-    fn go_up<E: Eight>(&mut self, recursion: &SpatialRecursion, first: usize) {
+    fn go_up<E: Eight>(&mut self, recursion: &SpatialRecursion<B>, first: usize) {
         let SpatialRecursion { limbs, groups, axes, within, .. } = recursion;
         let n = axes.len();
         let has = |reach: &Range<usize>, more: usize| {
@@ -173,10 +182,10 @@ impl Columns {
                 && first < reach.end + more
         };
         for Limb { groups: own, carries, hangs_from } in limbs {
-            let mut flow = [E::ZERO; 8];
+            let mut flow = [[E::ZERO; 8]; B];
             if let Some(place) = *carries {
                 flow = of_blocks(&self.flows[place]);
-                self.flows[place] = [Block::ZERO; 8];
+                self.flows[place] = [[Block::ZERO; 8]; B];
             }
             let mut any = false;
             for at in own.clone() {
@@ -212,8 +221,9 @@ impl Columns {
                 }
             }
             if let (true, Some(Fork { place, .. })) = (any, hangs_from) {
-                for (all, own) in self.flows[*place].iter_mut().zip(flow) {
-                    E::of(all).plus(own).put(all);
+                let all = self.flows[*place].as_flattened_mut().iter_mut();
+                for (all, own) in all.zip(flow.as_flattened()) {
+                    E::of(all).plus(*own).put(all);
                 }
             }
         }
@@ -223,7 +233,7 @@ impl Columns {
     #[inline(always)]
     fn go_down<E: Eight>(
         &mut self,
-        recursion: &SpatialRecursion,
+        recursion: &SpatialRecursion<B>,
         first: usize,
         rows: &mut Rows<'_>,
     ) {
@@ -232,7 +242,7 @@ impl Columns {
         for Limb { groups: own, carries, hangs_from, .. } in limbs.iter().rev() {
             let mut motion = match hangs_from {
                 Some(fork) => of_blocks(&self.motions[fork.place]),
-                None => [E::ZERO; 8],
+                None => [[E::ZERO; 8]; B],
             };
             for at in own.clone().rev() {
                 let Group { axes: range, rows: own, kind, .. } = &groups[at];
@@ -258,7 +268,8 @@ impl Columns {
                 }
             }
             if let Some(place) = carries {
-                for (to, own) in self.motions[*place].iter_mut().zip(motion) {
+                let all = self.motions[*place].as_flattened_mut().iter_mut();
+                for (to, own) in all.zip(motion.as_flattened()) {
                     own.put(to);
                 }
             }
@@ -267,8 +278,8 @@ impl Columns {
 }
 
 /// A group on the way up.
-struct Lifted<'a> {
-    margins: &'a [Margin],
+struct Lifted<'a, const B: usize> {
+    margins: &'a [Margin<Line<B>>],
     among: &'a Among,
     inverse: &'a Square,
     increment: &'a mut [Block],
@@ -278,9 +289,13 @@ struct Lifted<'a> {
     first: usize,
 }
 
-impl Lifted<'_> {
+impl<const B: usize> Lifted<'_, B> {
     #[inline(always)]
-    fn lift<E: Eight, const W: usize>(self, axes: [&Generators; W], flow: &mut [E; 8]) {
+    fn lift<E: Eight, const W: usize>(
+        self,
+        axes: [&Generators<Line<B>>; W],
+        flow: &mut Flow<E, B>,
+    ) {
         let Self { margins, among, inverse, increment, momentum, columns, first } = self;
         let [mut residual, mut carried] = [[E::ZERO; W]; 2];
         for a in 0..W {
@@ -314,8 +329,8 @@ impl Lifted<'_> {
 }
 
 /// A group on the way down.
-struct Lowered<'a> {
-    margins: &'a [Margin],
+struct Lowered<'a, const B: usize> {
+    margins: &'a [Margin<Line<B>>],
     among: &'a Among,
     increment: &'a [Block],
     momentum: &'a [Block],
@@ -324,12 +339,12 @@ struct Lowered<'a> {
     first: usize,
 }
 
-impl Lowered<'_> {
+impl<const B: usize> Lowered<'_, B> {
     #[inline(always)]
     fn lower<E: Eight, const W: usize>(
         self,
-        axes: [&Generators; W],
-        motion: &mut [E; 8],
+        axes: [&Generators<Line<B>>; W],
+        motion: &mut Flow<E, B>,
         rows: &mut Rows<'_>,
     ) {
         let Self { margins, among, increment, momentum, start, first } = self;
@@ -354,28 +369,32 @@ impl Lowered<'_> {
 }
 
 /// Takes from an elimination what the columns need.
-struct Keep<'a> {
-    columns: &'a mut Columns,
-    curvature: &'a Curvature,
-    step: Step,
-    added: Added<'a>,
+struct Keep<'a, const B: usize> {
+    columns: &'a mut Columns<B>,
+    vectors: Vectors<'a>,
     own: Own<'a>,
 }
 
-impl<E: Eight> Watch<E> for Keep<'_> {
+impl<E: Eight, const B: usize> Watch<E, B> for Keep<'_, B> {
     #[inline(always)]
-    fn see(&mut self, at: usize, group: &Group, axes: &[Generators], sums: Option<&Sums<E>>) {
-        let Self { columns, curvature, step, added, own } = self;
+    fn see(
+        &mut self,
+        at: usize,
+        group: &Group,
+        axes: &[Generators<Line<B>>],
+        sums: Option<&Sums<E, B>>,
+    ) {
+        let Self { columns, vectors, own } = self;
         let first = group.axes.start;
         let margins = &mut columns.margins[group.axes.clone()];
         let among = &mut columns.among[at];
         match group.kind {
             GroupKind::Single => {}
             GroupKind::Ball(ball) => {
-                let parts = step.parts_of_ball::<E>(curvature, first);
-                let flanks = Flanks::of_ball(&parts, &own.turnings[ball], &added.balls[ball]);
-                for (flanks, margin) in flanks.iter().zip(&mut *margins) {
-                    margin.take(flanks);
+                let (turning, weights) = (&own.turnings[ball], &vectors.added.balls[ball]);
+                let all = vectors.margins_of_ball::<E, B>(first, turning, weights);
+                for (own, margin) in all.into_iter().zip(&mut *margins) {
+                    own.put(margin);
                 }
                 among.take(&own.balls[ball]);
                 if let ([a, b, c], Some(sums)) = (axes, sums) {
@@ -384,12 +403,19 @@ impl<E: Eight> Watch<E> for Keep<'_> {
                 return;
             }
             GroupKind::Prescribed => {
-                margins[0].take_prescribed(&step.parts::<E>(curvature, first).generators(), sums);
+                let [own] = margins else { return };
+                vectors.moved::<E, B>(first).put(own);
+                let Margin { carry, push, above, below } = own;
+                if let Some(sums) = sums {
+                    for (above, below) in [(above, below), (carry, push)] {
+                        InLine::of(below).plus(combined(&sums.columns, above)).put(below);
+                    }
+                }
                 return;
             }
         }
         for (i, margin) in group.axes.clone().zip(&mut *margins) {
-            margin.take(&Flanks::of(&step.parts::<E>(curvature, i)));
+            vectors.margin::<E, B>(i).put(margin);
         }
         let Diagonals { residual, by_start, by_increment } = own.diagonals;
         let diagonals =
@@ -403,27 +429,14 @@ impl<E: Eight> Watch<E> for Keep<'_> {
     }
 }
 
-impl Margin {
+impl<E: Eight, const B: usize> Margin<InLine<E, B>> {
+    /// To memory.
     #[inline(always)]
-    fn take<E: Eight>(&mut self, flanks: &Flanks<E>) {
-        flanks.carry.put(&mut self.carry);
-        flanks.push.put(&mut self.push);
-        flanks.above.put(&mut self.above);
-        flanks.below.put(&mut self.below);
-    }
-
-    #[inline(always)]
-    fn take_prescribed<E: Eight>(&mut self, own: &Generators<E>, sums: Option<&Sums<E>>) {
-        let Self { carry, push, above, below } = self;
-        own.minus.put(above);
-        own.lower.put(below);
-        own.plus.put(carry);
-        own.upper.put(push);
-        if let Some(sums) = sums {
-            for (above, below) in [(above, below), (carry, push)] {
-                E::of(below).plus(combined(&sums.columns, above)).put(below);
-            }
-        }
+    fn put(self, to: &mut Margin<Line<B>>) {
+        self.carry.put(&mut to.carry);
+        self.push.put(&mut to.push);
+        self.above.put(&mut to.above);
+        self.below.put(&mut to.below);
     }
 }
 
@@ -441,25 +454,25 @@ impl Among {
 
 /// What hinges, slides and screws one below the other have among themselves.
 #[inline(always)]
-fn write_among<E: Eight, const W: usize>(
-    axes: [&Generators; W],
-    margins: &mut [Margin],
+fn write_among<E: Eight, const B: usize, const W: usize>(
+    axes: [&Generators<Line<B>>; W],
+    margins: &mut [Margin<Line<B>>],
     [residual, by_start, by_increment]: [&[f64]; 3],
     among: &mut Among,
-    sums: Option<&Sums<E>>,
+    sums: Option<&Sums<E, B>>,
 ) {
     for a in 0..W {
-        let [minus, plus] = [E::of(&axes[a].minus), E::of(&axes[a].plus)];
-        let [carry, above] = [E::of(&margins[a].carry), E::of(&margins[a].above)];
+        let [minus, plus] = [InLine::<E, B>::of(&axes[a].minus), InLine::of(&axes[a].plus)];
+        let [carry, above] = [InLine::<E, B>::of(&margins[a].carry), InLine::of(&margins[a].above)];
         for b in a..W {
-            let below = E::of(&margins[b].below);
+            let below = InLine::of(&margins[b].below);
             among.residual[a][b] = minus.dot(below);
             among.by_start[a][b] = carry.dot(below);
-            among.by_increment[a][b] = carry.dot(E::of(&axes[b].upper));
+            among.by_increment[a][b] = carry.dot(InLine::of(&axes[b].upper));
         }
         for b in a + 1..W {
-            let push = E::of(&margins[b].push);
-            among.residual[b][a] = above.dot(E::of(&axes[b].lower));
+            let push = InLine::of(&margins[b].push);
+            among.residual[b][a] = above.dot(InLine::of(&axes[b].lower));
             among.by_start[b][a] = above.dot(push);
             among.by_increment[b][a] = plus.dot(push);
         }
@@ -474,48 +487,46 @@ fn write_among<E: Eight, const W: usize>(
 
 /// Adds what is below.
 #[inline(always)]
-fn include<E: Eight, const W: usize>(
-    axes: [&Generators; W],
-    margins: &mut [Margin],
+fn include<E: Eight, const B: usize, const W: usize>(
+    axes: [&Generators<Line<B>>; W],
+    margins: &mut [Margin<Line<B>>],
     among: &mut Among,
-    sums: &Sums<E>,
+    sums: &Sums<E, B>,
 ) {
     for b in 0..W {
         let above = combined(&sums.columns, &margins[b].above);
         let plus = combined(&sums.columns, &axes[b].plus);
         for a in 0..W {
-            let carry = E::of(&margins[a].carry);
-            among.residual[a][b] += E::of(&axes[a].minus).dot(above);
+            let carry = InLine::<E, B>::of(&margins[a].carry);
+            among.residual[a][b] += InLine::of(&axes[a].minus).dot(above);
             among.by_start[a][b] += carry.dot(above);
             among.by_increment[a][b] += carry.dot(plus);
         }
         let Margin { carry, push, below, .. } = &mut margins[b];
-        E::of(below).plus(above).put(below);
-        E::of(push).plus(combined(&sums.rows, carry)).put(push);
+        InLine::of(below).plus(above).put(below);
+        InLine::of(push).plus(combined(&sums.rows, carry)).put(push);
     }
 }
 
 /// A factorization and the columns.
-pub(super) struct Linearize<'a> {
-    pub(super) recursion: &'a mut SpatialRecursion,
-    pub(super) columns: &'a mut Columns,
-    pub(super) curvature: &'a Curvature,
-    pub(super) added: Added<'a>,
-    pub(super) own: Own<'a>,
-    pub(super) inertia: &'a [f64],
-    pub(super) step: Step,
-    pub(super) rows: Rows<'a>,
+struct Linearize<'a, const B: usize> {
+    recursion: &'a mut SpatialRecursion<B>,
+    columns: &'a mut Columns<B>,
+    vectors: Vectors<'a>,
+    own: Own<'a>,
+    inertia: &'a [f64],
+    rows: Rows<'a>,
 }
 
-impl InEights for Linearize<'_> {
+impl<const B: usize> InEights for Linearize<'_, B> {
     type Output = SmallestPivot;
 
     #[inline(always)]
     fn run<E: Eight>(self) -> SmallestPivot {
-        let Self { recursion, columns, curvature, added, own, inertia, step, mut rows } = self;
-        let mut keep = Keep { columns, curvature, step, added, own };
+        let Self { recursion, columns, vectors, own, inertia, mut rows } = self;
+        let mut keep = Keep { columns, vectors, own };
         let recursion = &mut *recursion;
-        let factor = Factor { recursion: &mut *recursion, curvature, added, inertia, step };
+        let factor = Factor { recursion: &mut *recursion, vectors, inertia };
         let pivot = factor.watched::<E>(&mut keep);
         let recursion = &*recursion;
         for first in (0..2 * recursion.axes.len()).step_by(LANES) {
@@ -526,7 +537,7 @@ impl InEights for Linearize<'_> {
     }
 }
 
-impl SpatialRecursion {
+impl<const B: usize> SpatialRecursion<B> {
     /// Whether a linearization takes less time by columns than with so many entries in each triangle of the Newton
     /// matrix. What forks cost is in the number of limbs. Of the time entry by entry it took:
     ///
@@ -535,23 +546,80 @@ impl SpatialRecursion {
     /// time                                      1.5           1.5          1.4           1.5            1.45
     /// entries over joints and limbs      arm of 7 hinges 3.5   balls-3 3   walker-2 4.6   walker-4 5.1   chain-8 4
     /// time                                             0.9           0.8            0.7            0.7         0.85
+    /// and with vectors of two blocks     chain-8 4   quadruped 4.3   rope of 16 8   rope of 32 16
+    /// time                                    1.05             1.2           0.75            0.43
     /// ```
-    pub(crate) fn is_faster_by_columns(&self, entries: usize) -> bool {
-        10 * entries > 31 * (self.axes.len() + self.limbs.len())
+    fn is_faster_by_columns(&self, entries: usize) -> bool {
+        let least = if B == 1 { 31 } else { 48 };
+        10 * entries > least * (self.axes.len() + self.limbs.len())
+    }
+}
+
+/// A recursion and its columns.
+#[derive(Clone, Debug)]
+pub(crate) struct WithColumns<const B: usize> {
+    recursion: SpatialRecursion<B>,
+    columns: Columns<B>,
+}
+
+impl<const B: usize> WithColumns<B> {
+    fn new(model: &Model) -> Self {
+        let recursion = SpatialRecursion::new(model);
+        Self { columns: Columns::new(&recursion), recursion }
     }
 
-    /// Factors as [`Self::factor`] does, and writes the derivatives of the increment and of the momentum by
+    /// Factors as [`SpatialRecursion::factor`] does, and writes the derivatives of the increment and of the momentum by
     /// configuration and momentum, into rows of whole blocks.
     #[inline(never)]
-    pub(crate) fn linearize(
+    fn linearize(
         &mut self,
-        columns: &mut Columns,
-        curvature: &Curvature,
-        (added, own): (Added<'_>, Own<'_>),
-        (inertia, step): (&[f64], Step),
+        vectors: Vectors<'_>,
+        own: Own<'_>,
+        inertia: &[f64],
         rows: Rows<'_>,
     ) -> SmallestPivot {
-        let recursion = self;
-        in_eights(Linearize { recursion, columns, curvature, added, own, inertia, step, rows })
+        let Self { recursion, columns } = self;
+        in_eights(Linearize { recursion, columns, vectors, own, inertia, rows })
+    }
+}
+
+/// A linearization by generators in space, whatever steps are solved by.
+#[derive(Clone, Debug)]
+pub(crate) enum InSpace {
+    OfBodies(WithColumns<1>),
+    WithFields(WithColumns<2>),
+}
+
+impl InSpace {
+    pub(crate) fn new(model: &Model) -> Self {
+        match model.has_fields() {
+            false => Self::OfBodies(WithColumns::new(model)),
+            true => Self::WithFields(WithColumns::new(model)),
+        }
+    }
+
+    /// Whether it takes less time than with so many entries in each triangle of the Newton matrix.
+    pub(crate) fn is_faster(&self, entries: usize) -> bool {
+        match self {
+            Self::OfBodies(own) => own.recursion.is_faster_by_columns(entries),
+            Self::WithFields(own) => own.recursion.is_faster_by_columns(entries),
+        }
+    }
+
+    /// Factors, and writes the derivatives of the increment and of the momentum by configuration and momentum, into
+    /// rows of whole blocks.
+    pub(crate) fn linearize(
+        &mut self,
+        (curvature, added): (&Curvature, Added<'_>),
+        own: Own<'_>,
+        (inertia, time_step_s): (&[f64], f64),
+        rows: Rows<'_>,
+    ) -> SmallestPivot {
+        let vectors =
+            Vectors { curvature, added, step: Step::new(time_step_s, MatrixKind::Newton) };
+        match self {
+            Self::OfBodies(all) => all.linearize(vectors, own, inertia, rows),
+            Self::WithFields(all) => all.linearize(vectors, own, inertia, rows),
+        }
     }
 }

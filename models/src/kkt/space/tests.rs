@@ -10,8 +10,10 @@ use plantd_scene::{CoordinateKind, Scene, Spring, builtin};
 use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
 use crate::integrator::workspace::Workspace;
-use crate::kkt::space::SpatialRecursion;
-use crate::kkt::system::{InSpace, Linearized, Recursion};
+use crate::kkt::space::Spatial;
+use crate::kkt::space::columns::InSpace;
+use crate::kkt::system::{Linearized, Recursion};
+use crate::lagrangian::fields::Fields;
 use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::samples::rubbing;
 use crate::linearization::linearize::Linearization;
@@ -93,6 +95,14 @@ fn rope(n: usize, more: &str) -> String {
     text + more
 }
 
+/// Solves by generators, whatever the model is solved by.
+fn generate(workspace: &mut Workspace, model: &Model) {
+    assert!(model.is_generated_in_space());
+    workspace.kkt.factored.recursion = Recursion::Spatial(Box::new(Spatial::new(model)));
+    workspace.kkt.in_space = Some(Box::new(InSpace::new(model)));
+    workspace.kkt.fields = model.has_fields().then(|| Box::new(Fields::new(model)));
+}
+
 /// The matrix that is filled entry by entry.
 fn dense(model: &Model, matrix: &TreeLu) -> DMatrix<f64> {
     let n = model.dimensions.dynamic;
@@ -123,8 +133,7 @@ fn a_solution_satisfies_the_dense_system() {
         let n = model.dimensions.dynamic;
         let settings = Settings { time_step_s: 0.02, ..Settings::new(&model) };
         let mut workspace = Workspace::new(&model);
-        let generators = SpatialRecursion::new(&model);
-        workspace.kkt.factored.recursion = Recursion::Spatial(Box::new(generators));
+        generate(&mut workspace, &model);
         for trial in 0..5 {
             for i in 0..n {
                 workspace.mid.q[i] = wave(100 * trial + i);
@@ -170,9 +179,7 @@ fn both(model: &Arc<Model>, order: u32) -> [Plant; 2] {
     let settings = Settings { order, ..Settings::new(model) };
     let mut fast = Plant::new(Arc::clone(model), settings).unwrap();
     assert!(order == 2 || model.solver == Solver::Spatial);
-    let generators = SpatialRecursion::new(model);
-    fast.workspace.kkt.factored.recursion = Recursion::Spatial(Box::new(generators));
-    fast.workspace.kkt.in_space = Some(Box::new(InSpace::new(model)));
+    generate(&mut fast.workspace, model);
     let n = model.dimensions.coordinates();
     let turned = |i: usize| if i < 2 { 0.5 } else { 0.02 * (1.3 * i as f64).sin() };
     let q = (0..n).map(turned).collect();
@@ -373,13 +380,104 @@ fn joints_that_are_moved_pass_on_what_is_below_them() {
     }
 }
 
+/// Springs, dampers and drag between points of two bodies and the world, and wrenches on one of them.
+fn fields(bodies: [&str; 2]) -> String {
+    let [a, b] = bodies;
+    let world = "{ frame = \"world\", at = [0.3, -0.4, 1.5] }";
+    let point = |frame: &str, kind: &str, more: &str| {
+        format!(
+            "type = \"{kind}\"\na = {{ frame = \"{frame}\", at = [0.2, 0.1, -0.3] }}\nb = {world}\n{more}\n"
+        )
+    };
+    let back = |frame: &str, kind: &str, more: &str| {
+        format!("type = \"{kind}\"\nb = {{ frame = \"{frame}\" }}\na = {world}\n{more}\n")
+    };
+    let springs = [
+        point(a, "two_point", "stiffness = 20.0\nrest_length = 0.4"),
+        back(b, "two_point", "stiffness = 7.0"),
+    ];
+    let wrench = "force = [0.3, \"thrust\", 0.7]\ntorque = [\"thrust\", -0.3, 0.2]";
+    let forces = [
+        point(a, "two_point_damper", "damping = 0.8"),
+        back(b, "two_point_damper", "damping = 1.1"),
+        format!("type = \"drag\"\nframe = \"{b}\"\nat = [0.3, -0.2, 0.1]\ncoefficient = 0.5"),
+        format!("type = \"body_wrench\"\nframe = \"{a}\"\n{wrench}"),
+        format!("type = \"spatial_wrench\"\nframe = \"{b}\"\n{wrench}"),
+        format!("type = \"hybrid_wrench\"\nframe = \"{a}\"\n{wrench}"),
+    ];
+    let mut text = "[[inputs]]\nname = \"thrust\"\n".to_owned();
+    springs.iter().for_each(|spring| text += &format!("[[springs]]\n{spring}\n"));
+    forces.iter().for_each(|force| text += &format!("[[forces]]\n{force}\n"));
+    text
+}
+
+/// A scene and what acts on it from the world; some coordinates are moved.
+fn pulled(model: &Model, bodies: [&str; 2], more: &str, moved: &[&str]) -> Model {
+    let mut scene = Scene::from_toml(&(model.scene().to_toml() + &fields(bodies) + more)).unwrap();
+    for coordinate in &mut scene.coordinates {
+        if moved.contains(&&*coordinate.name) {
+            coordinate.kind = CoordinateKind::Prescribed;
+            (coordinate.damping, coordinate.armature) = (None, 0.0);
+        }
+    }
+    scene.springs.retain(|spring| match spring {
+        Spring::Coordinate { coordinate, .. } => !moved.contains(&&**coordinate),
+        _ => true,
+    });
+    Model::compile(&scene).unwrap()
+}
+
+/// What acts on bodies from the world has vectors of two blocks, and springs of ball joints are their own.
+#[test]
+fn what_acts_from_the_world_is_generated() {
+    let tree = "gravity = [1.0, -2.0, -9.0]\ntime_step_s = 0.002";
+    let sprung = "[[springs]]\ntype = \"orientation\"\nframe = \"f4\"\nstiffness = 9.0\n";
+    for (steps, model) in [
+        (50, pulled(&branching(24, tree, ""), ["f23", "f10"], "", &[])),
+        (
+            50,
+            pulled(&branching(24, tree, "damping = 0.3"), ["f21", "f22"], "", &["f2", "f7", "f9"]),
+        ),
+        (50, pulled(&floating(), ["f8", "f4"], sprung, &[])),
+        (50, pulled(&floating(), ["f7", "f6"], sprung, &["f1", "f5", "f7"])),
+        (5, pulled(&compiled(&rope(24, "")), ["f23", "f11"], "", &[])),
+    ] {
+        let (d, model) = (model.dimensions, Arc::new(model));
+        assert!(model.has_fields());
+        let [mut fast, mut slow] = both(&model, 2);
+        let mut linear = [Linearization::new(&model), Linearization::new(&model)];
+        let mut u = vec![0.4; d.input()];
+        let start: Vec<f64> = fast.q()[d.dynamic..].to_vec();
+        for k in 0..steps {
+            for (i, start) in start.iter().enumerate() {
+                u[d.inputs + i] = start + 0.1 * (0.05 * f64::from(k + 1) * (1.0 + wave(i))).sin();
+            }
+            fast.step_and_linearize(&u, &mut linear[0]).unwrap();
+            slow.step_and_linearize(&u, &mut linear[1]).unwrap();
+        }
+        for (a, b) in fast.q().iter().zip(slow.q()) {
+            assert!((a - b).abs() < 1e-9, "{} {a} {b}", model.scene().name);
+        }
+        let [a, b] = linear.each_ref().map(|l| l.a());
+        assert!((&a - &b).amax() <= 1e-9 * b.amax(), "{:e} {:e}", (&a - &b).amax(), b.amax());
+        let [a, b] = linear.each_ref().map(|l| l.b());
+        assert!((&a - &b).amax() <= 1e-9 * b.amax(), "{:e} {:e}", (&a - &b).amax(), b.amax());
+        let (workspace, settings) = (&mut fast.workspace, &fast.settings);
+        workspace.fill_newton_matrix(&model, settings);
+        let matrix = dense(&model, &workspace.kkt.factored.tree);
+        assert!(workspace.factor_recursion(&model, settings).unwrap());
+        assert_solves(workspace, &model, &matrix);
+    }
+}
+
 /// Steps and linearizations in all registers that the processor has, from the same start: few joints and many, hinges
 /// and ball joints, entry by entry and by generators.
 #[test]
 fn all_registers_give_the_same_motion() {
     let named = |name: &str| Model::compile(&builtin::scene(name).unwrap()).unwrap();
-    let models =
-        [floating(), named("spherical-pendulum"), named("tree-15"), compiled(&rope(20, ""))];
+    let rope = compiled(&rope(20, ""));
+    let swung = pulled(&rope, ["f19", "f9"], "", &[]);
+    let models = [floating(), named("spherical-pendulum"), named("tree-15"), rope, swung];
     for model in models.map(Arc::new) {
         let motion = |registers| {
             within(registers, || {

@@ -11,6 +11,7 @@
 use plantd_math::scalar::Scalar;
 use plantd_math::spatial::{Motion, Vec3};
 
+use crate::lagrangian::fields::{Field, Take, at_point, change_at_point};
 use crate::lagrangian::forces::{GeneralizedForce, Instant};
 use crate::lagrangian::vectors::Separation;
 use crate::model::mechanism::{Carries, PathJoint, PointForce, PointLaw};
@@ -105,6 +106,27 @@ impl GeneralizedForce for PointForce {
                 );
             }
         }
+    }
+}
+
+impl Field for PointForce {
+    fn joint(&self) -> usize {
+        self.ends.from_world().map_or(WORLD, |(end, _)| end.joint)
+    }
+
+    fn exert(&self, at: &Instant<'_>, take: Take<'_>) {
+        let Some((end, carries)) = self.ends.from_world() else { return };
+        let acting = Acting::new(self, at);
+        let (point, force) = match carries {
+            Carries::A => (acting.at.a, acting.force),
+            _ => (acting.at.b, -acting.force),
+        };
+        let velocity = twist(at, end).at(point);
+        take(at_point(point, force), &|axis, rate| {
+            let moved = axis.at(point);
+            let changed = acting.change(moved, rate.at(point) + axis.w.cross(velocity));
+            change_at_point([point, force], [moved, changed])
+        });
     }
 }
 

@@ -14,6 +14,7 @@
 use plantd_math::scalar::Scalar;
 use plantd_math::spatial::{Force, Vec3};
 
+use crate::lagrangian::fields::{Field, Take};
 use crate::lagrangian::forces::{GeneralizedForce, Instant};
 use crate::model::mechanism::{Wrench, WrenchKind};
 
@@ -97,6 +98,22 @@ impl GeneralizedForce for Wrench {
                 entry(at.tree.joints[joint].coordinate, *input, by_u);
             }
         }
+    }
+}
+
+impl Field for Wrench {
+    fn joint(&self) -> usize {
+        self.at.joint
+    }
+
+    fn exert(&self, at: &Instant<'_>, take: Take<'_>) {
+        let wrench = self.total(at);
+        let (point, _) = at.poses.point(at.tree, &self.at);
+        take(wrench, &|axis, _| match self.kind {
+            WrenchKind::Body => axis.cross_force(wrench),
+            WrenchKind::Spatial => Force::default(),
+            WrenchKind::Hybrid => Force { n: axis.at(point).cross(wrench.f), f: Vec3::ZERO },
+        });
     }
 }
 

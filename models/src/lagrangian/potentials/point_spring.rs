@@ -10,10 +10,13 @@
 use plantd_math::scalar::Scalar;
 use plantd_math::spatial::Vec3;
 
+use crate::lagrangian::fields::{Field, Take, at_point, change_at_point};
+use crate::lagrangian::forces::Instant;
 use crate::lagrangian::kinematics::Place;
 use crate::lagrangian::potentials::Potential;
 use crate::lagrangian::vectors::Separation;
-use crate::model::mechanism::PointSpring;
+use crate::model::mechanism::{Carries, PointSpring};
+use crate::model::tree::WORLD;
 
 /// A two-point spring at one configuration.
 struct Stretched<S> {
@@ -36,6 +39,26 @@ fn stretched<S: Scalar>(spring: &PointSpring, place: Place<'_, S>) -> Stretched<
     let tension = (length - spring.rest_length) * inverse * spring.stiffness;
     let bend = inverse * inverse * inverse * (spring.stiffness * spring.rest_length);
     Stretched { at, tension, bend }
+}
+
+impl Field for PointSpring {
+    fn joint(&self) -> usize {
+        self.ends.from_world().map_or(WORLD, |(end, _)| end.joint)
+    }
+
+    fn exert(&self, at: &Instant<'_>, take: Take<'_>) {
+        let Some((_, carries)) = self.ends.from_world() else { return };
+        let Instant { tree, poses, q, .. } = *at;
+        let Stretched { at, tension, bend } = stretched(self, Place { tree, poses, q });
+        let d = at.difference;
+        let (point, sign) = if carries == Carries::A { (at.a, -1.0) } else { (at.b, 1.0) };
+        let force = d * (sign * tension);
+        take(at_point(point, force), &|axis, _| {
+            let moved = axis.at(point);
+            let changed = moved * -tension - d * (bend * d.dot(moved));
+            change_at_point([point, force], [moved, changed])
+        });
+    }
 }
 
 impl Potential for PointSpring {

@@ -1,0 +1,122 @@
+//! How the time of a step, of A and B, and the memory of a plant grow with a rope in space that has what sends other
+//! programs to dense matrices: a top that is moved, a ball joint, and a spring from its tip to the world.
+//!
+//! `cargo run --release -p plantd-models --example growth`
+
+use std::error::Error;
+use std::hint::black_box;
+use std::sync::Arc;
+use std::time::Instant;
+
+use plantd_models::{Layout, Linearization, Model, Plant, Scene, Settings, StepError};
+
+/// Joints; the ball joint has three.
+const SIZES: [usize; 4] = [64, 128, 256, 512];
+
+/// Thin rods, 1 m and 1 kg together, hinged about x and y by turns below a slide that is moved. The last one has a ball
+/// joint.
+fn rope(joints: usize) -> Result<Scene, Box<dyn Error>> {
+    let rods = joints - 2;
+    let length = 1.0 / rods as f64;
+    let across = length.powi(3) / 12.0;
+    let mut text = format!(
+        "format = 1\nname = \"rope\"\ngravity = [0.0, 0.0, -9.8]\ntime_step_s = {}\n",
+        0.04 * length
+    );
+    for i in 0..rods {
+        let (parent, z) =
+            if i == 0 { ("world".to_owned(), 0.0) } else { (format!("rod{}", i - 1), -length) };
+        let joint = match i {
+            0 => "type = \"prismatic\", axis = [0.0, 1.0, 0.0]",
+            _ if i + 1 == rods => "type = \"ball\"",
+            _ if i % 2 == 0 => "type = \"revolute\", axis = [1.0, 0.0, 0.0]",
+            _ => "type = \"revolute\", axis = [0.0, 1.0, 0.0]",
+        };
+        let center = -0.5 * length;
+        let along = 0.1 * across;
+        text += &format!(
+            "[[frames]]\nname = \"rod{i}\"\nparent = \"{parent}\"\ntranslation = [0.0, 0.0, {z}]\n\
+             joint = {{ {joint} }}\nbody = {{ mass = {length}, center_of_mass = [0.0, 0.0, {center}], \
+             inertia = [{across}, {across}, {along}] }}\n"
+        );
+    }
+    text += "[[coordinates]]\nname = \"rod0\"\nkind = \"prescribed\"\n\
+             [[coordinates]]\nname = \"rod1\"\ninitial = 0.2\n\
+             [[coordinates]]\nname = \"rod2\"\ninitial = 0.2\n";
+    text += &format!(
+        "[[springs]]\ntype = \"two_point\"\na = {{ frame = \"rod{}\" }}\n\
+         b = {{ frame = \"world\", at = [0.0, 0.0, -1.2] }}\nstiffness = 2.0\n",
+        rods - 1
+    );
+    Ok(Scene::from_toml(&text)?)
+}
+
+/// The shortest of several times of a call, from the same start, µs.
+fn shortest_us(
+    plant: &mut Plant,
+    calls: u32,
+    mut call: impl FnMut(&mut Plant, &[f64]) -> Result<(), StepError>,
+) -> Result<f64, Box<dyn Error>> {
+    let (start, mut best) = (plant.snapshot(), f64::INFINITY);
+    for _ in 0..9 {
+        plant.restore(&start)?;
+        let begin = Instant::now();
+        for _ in 0..calls {
+            let top = 0.02 * (3.0 * plant.time_s()).sin();
+            call(plant, &[top])?;
+        }
+        best = best.min(begin.elapsed().as_secs_f64() * 1e6 / f64::from(calls));
+    }
+    Ok(best)
+}
+
+/// Resident memory of this process, KiB.
+fn resident() -> Result<f64, Box<dyn Error>> {
+    let text = std::fs::read_to_string("/proc/self/status")?;
+    let line = text.lines().find_map(|line| line.strip_prefix("VmRSS:")).ok_or("no VmRSS")?;
+    Ok(line.trim().trim_end_matches(" kB").parse()?)
+}
+
+/// The slope of the logarithms of numbers over those of sizes.
+fn exponent(numbers: &[f64]) -> f64 {
+    let points: Vec<[f64; 2]> =
+        SIZES.iter().zip(numbers).map(|(n, y)| [(*n as f64).ln(), y.ln()]).collect();
+    let mean = |k: usize| points.iter().map(|p| p[k]).sum::<f64>() / points.len() as f64;
+    let [x, y] = [mean(0), mean(1)];
+    let over = points.iter().map(|p| (p[0] - x) * (p[1] - y)).sum::<f64>();
+    over / points.iter().map(|p| (p[0] - x).powi(2)).sum::<f64>()
+}
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let mut all: [Vec<f64>; 3] = Default::default();
+    println!("joints   step, µs   step, A and B, µs   memory of a plant, KiB");
+    for joints in SIZES {
+        let model = Arc::new(Model::compile(&rope(joints)?)?);
+        let settings = Settings::new(&model);
+        let mut plant = Plant::new(Arc::clone(&model), settings)?;
+        let d = model.dimensions();
+        plant.step(&[0.0])?;
+
+        let count = 16;
+        let before = resident()?;
+        let plants: Vec<Plant> = (0..count).map(|_| plant.clone()).collect();
+        let memory = (resident()? - before) / f64::from(count);
+        drop(black_box(plants));
+
+        let step = shortest_us(&mut plant, 100, |plant, u| plant.step(u).map(drop))?;
+        let mut out = Linearization::new(&model);
+        let (mut a, mut b) = (vec![0.0; d.state() * d.state()], vec![0.0; d.state() * d.input()]);
+        let linearized = shortest_us(&mut plant, 20, |plant, u| {
+            plant.step_and_linearize(u, &mut out)?;
+            out.a_into(&mut a, Layout::Columns);
+            out.b_into(&mut b, Layout::Columns);
+            black_box((&a, &b));
+            Ok(())
+        })?;
+        println!("{joints:6} {step:10.1} {linearized:19.1} {memory:24.0}");
+        all.iter_mut().zip([step, linearized, memory]).for_each(|(all, own)| all.push(own));
+    }
+    let [step, linearized, memory] = all.map(|numbers| exponent(&numbers));
+    println!("growth   n^{step:.2}     n^{linearized:.2}              n^{memory:.2}");
+    Ok(())
+}

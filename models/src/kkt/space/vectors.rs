@@ -1,0 +1,212 @@
+//! The vectors of joints, of one block or of two.
+//!
+//! Without elements that act on bodies from the world they are those of
+//! [`generators`](crate::lagrangian::generators). With such elements the second block has, in the notation of
+//! [`fields`](crate::lagrangian::fields), what goes with the axes alone:
+//!
+//! ```text
+//! minus = plus = axis      upper = ¼h pull + ½ drag      lower = ¼h turn      and ½ back more in the first of lower
+//! carry = above = 2 axis   below = ½h pull               push = ½h turn       and back more in the first of push
+//! ```
+//!
+//! which ball joints weigh as they do rates and slopes. Of a joint that is moved, `lower` counts `¼h pull − ½ drag`.
+
+use plantd_math::eights::Eight;
+
+use crate::kkt::space::Added;
+use crate::kkt::space::lines::InLine;
+use crate::lagrangian::curvature::Curvature;
+use crate::lagrangian::fields::{Fields, Given};
+use crate::lagrangian::generators::{Flanks, Generators, Step, columns, of_ball, rows};
+use crate::lagrangian::turning::{Turning, Weights};
+
+/// What the vectors of a step are made of.
+#[derive(Clone, Copy)]
+pub(crate) struct Vectors<'a> {
+    pub(crate) curvature: &'a Curvature,
+    pub(crate) step: Step,
+    pub(crate) added: Added<'a>,
+}
+
+/// What the columns of a linearization need of an axis beside its generators. Of an axis whose motion is prescribed,
+/// and which has no rows, `carry` and `push` are what `above` and `below` are, by its next position.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Margin<V> {
+    pub(crate) carry: V,
+    /// `push + Aᵀ carry`.
+    pub(crate) push: V,
+    pub(crate) above: V,
+    /// `below + A above`.
+    pub(crate) below: V,
+}
+
+/// `¼h pull`, `¼h turn`, `½ drag` and `½ back`.
+#[derive(Clone, Copy)]
+struct Pulls<E> {
+    pull: E,
+    turn: E,
+    drag: E,
+    back: E,
+}
+
+impl Vectors<'_> {
+    #[inline(always)]
+    fn pulls<E: Eight>(&self, joint: usize) -> Pulls<E> {
+        let zero = Pulls { pull: E::ZERO, turn: E::ZERO, drag: E::ZERO, back: E::ZERO };
+        let Some(Fields { given, .. }) = self.added.fields else { return zero };
+        let Given { pull, turn, drag, back } = &given[joint];
+        let Step { motion, half, .. } = self.step;
+        let quarter = half * motion;
+        Pulls {
+            pull: E::of(pull).scaled(quarter),
+            turn: E::of(turn).scaled(quarter),
+            drag: E::of(drag).scaled(motion),
+            back: E::of(back).scaled(motion),
+        }
+    }
+
+    /// Of a hinge, a slide or a screw.
+    #[inline(always)]
+    pub(crate) fn single<E: Eight, const B: usize>(
+        &self,
+        joint: usize,
+    ) -> Generators<InLine<E, B>> {
+        let parts = self.step.parts::<E>(self.curvature, joint);
+        let (own, axis) = (parts.generators(), parts.axis);
+        if B == 1 {
+            return alone(&own);
+        }
+        let Pulls { pull, turn, drag, back } = self.pulls::<E>(joint);
+        Generators {
+            minus: InLine::new(own.minus, || axis),
+            plus: InLine::new(own.plus, || axis),
+            upper: InLine::new(own.upper, || pull.plus(drag)),
+            lower: InLine::new(own.lower.plus(back), || turn),
+        }
+    }
+
+    /// Of the axes of a ball joint, and what these have among themselves.
+    #[inline(always)]
+    pub(crate) fn ball<E: Eight, const B: usize>(
+        &self,
+        first: usize,
+        weights: &Weights,
+    ) -> ([Generators<InLine<E, B>>; 3], [[f64; 3]; 3]) {
+        let parts = self.step.parts_of_ball::<E>(self.curvature, first);
+        let (own, within) = of_ball(&parts, weights);
+        let mut all = [alone(&own[0]), alone(&own[1]), alone(&own[2])];
+        if B == 1 {
+            return (all, within);
+        }
+        let [p, q, r] = [self.pulls::<E>(first), self.pulls(first + 1), self.pulls(first + 2)];
+        let axes = [parts[0].axis, parts[1].axis, parts[2].axis];
+        let minus = rows(&weights.torque, &axes);
+        let plus = columns(&weights.column, &axes);
+        let pull = columns(&weights.column, &[p.pull, q.pull, r.pull]);
+        let turn = rows(&weights.torque, &[p.turn, q.turn, r.turn]);
+        let back = rows(&weights.torque, &[p.back, q.back, r.back]);
+        let drag = [p.drag, q.drag, r.drag];
+        for (a, all) in all.iter_mut().enumerate() {
+            let own = &own[a];
+            *all = Generators {
+                minus: InLine::new(own.minus, || minus[a]),
+                plus: InLine::new(own.plus, || plus[a]),
+                upper: InLine::new(own.upper, || pull[a].plus(drag[a])),
+                lower: InLine::new(own.lower.plus(back[a]), || turn[a]),
+            };
+        }
+        (all, within)
+    }
+
+    /// What a hinge, a slide or a screw gives to a linearization.
+    #[inline(always)]
+    pub(crate) fn margin<E: Eight, const B: usize>(&self, joint: usize) -> Margin<InLine<E, B>> {
+        let parts = self.step.parts::<E>(self.curvature, joint);
+        let pulls = if B == 1 { None } else { Some(self.pulls(joint)) };
+        let axis = twice(parts.axis);
+        margin(&Flanks::of(&parts), pulls, axis, axis)
+    }
+
+    /// What the axes of a ball joint give to it.
+    #[inline(always)]
+    pub(crate) fn margins_of_ball<E: Eight, const B: usize>(
+        &self,
+        first: usize,
+        turning: &Turning,
+        weights: &Weights,
+    ) -> [Margin<InLine<E, B>>; 3] {
+        let parts = self.step.parts_of_ball::<E>(self.curvature, first);
+        let [p, q, r] = &Flanks::of_ball(&parts, turning, weights);
+        if B == 1 {
+            let none = E::ZERO;
+            return [
+                margin(p, None, none, none),
+                margin(q, None, none, none),
+                margin(r, None, none, none),
+            ];
+        }
+        let [k, l, m] = [self.pulls::<E>(first), self.pulls(first + 1), self.pulls(first + 2)];
+        let twice = [twice(parts[0].axis), twice(parts[1].axis), twice(parts[2].axis)];
+        let above = columns(&turning.by_start.0, &twice);
+        let pull = columns(&turning.by_start.0, &[k.pull, l.pull, m.pull]);
+        [
+            margin(p, Some(Pulls { pull: pull[0], ..k }), twice[0], above[0]),
+            margin(q, Some(Pulls { pull: pull[1], ..l }), twice[1], above[1]),
+            margin(r, Some(Pulls { pull: pull[2], ..m }), twice[2], above[2]),
+        ]
+    }
+
+    /// What a joint that is moved gives to it.
+    #[inline(always)]
+    pub(crate) fn moved<E: Eight, const B: usize>(&self, joint: usize) -> Margin<InLine<E, B>> {
+        let parts = self.step.parts::<E>(self.curvature, joint);
+        let (own, axis) = (parts.generators(), parts.axis);
+        let pulls = || self.pulls::<E>(joint);
+        Margin {
+            above: InLine::new(own.minus, || axis),
+            below: InLine::new(own.lower, || pulls().pull.minus(pulls().drag)),
+            carry: InLine::new(own.plus, || axis),
+            push: InLine::new(own.upper, || pulls().pull.plus(pulls().drag)),
+        }
+    }
+}
+
+/// Generators of one block.
+#[inline(always)]
+fn alone<E: Eight, const B: usize>(own: &Generators<E>) -> Generators<InLine<E, B>> {
+    Generators {
+        minus: InLine::new(own.minus, || E::ZERO),
+        plus: InLine::new(own.plus, || E::ZERO),
+        upper: InLine::new(own.upper, || E::ZERO),
+        lower: InLine::new(own.lower, || E::ZERO),
+    }
+}
+
+#[inline(always)]
+fn twice<E: Eight>(numbers: E) -> E {
+    numbers.plus(numbers)
+}
+
+/// A margin, with what acts from the world where that counts.
+#[inline(always)]
+fn margin<E: Eight, const B: usize>(
+    Flanks { carry, push, above, below, .. }: &Flanks<E>,
+    pulls: Option<Pulls<E>>,
+    axis_of_row: E,
+    axis_of_column: E,
+) -> Margin<InLine<E, B>> {
+    let Some(pulls) = pulls else {
+        return Margin {
+            carry: InLine::new(*carry, || E::ZERO),
+            push: InLine::new(*push, || E::ZERO),
+            above: InLine::new(*above, || E::ZERO),
+            below: InLine::new(*below, || E::ZERO),
+        };
+    };
+    Margin {
+        carry: InLine::new(*carry, || axis_of_row),
+        push: InLine::new(push.plus(twice(pulls.back)), || twice(pulls.turn)),
+        above: InLine::new(*above, || axis_of_column),
+        below: InLine::new(*below, || twice(pulls.pull)),
+    }
+}

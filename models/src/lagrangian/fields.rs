@@ -1,0 +1,267 @@
+//! What acts on a body at a pose, from the world, to the second derivatives: springs, dampers and drag between a
+//! point and the world, and wrenches.
+//!
+//! Such an element exerts a wrench `W(q, v)` on its body. With the axis `J_j` of a joint above the body and its rate
+//! `J̇_j`, about the origin of the tree,
+//!
+//! ```text
+//! ∂W/∂q_j = C J_j + D J̇_j      ∂W/∂v_j = D J_j
+//! ```
+//!
+//! where `C` and `D` are 6 by 6. The generalized force of joint `i` is `J_i · W`, summed over what hangs from it; with
+//! these sums, for `i` above `j` (or `i = j`),
+//!
+//! ```text
+//! ∂f_i/∂q_j = J_i · pull_j                  pull = C J + D J̇      ∂f_i/∂v_j = J_i · drag_j      drag = D J
+//! ∂f_j/∂q_i = J_i · turn_j + J̇_i · back_j   turn = J ×* W + Cᵀ J  ∂f_j/∂v_i = J_i · back_j      back = Dᵀ J
+//! ```
+//!
+//! so that a spring on a long chain does not fill the Newton matrix: see
+//! [`generators`](crate::lagrangian::generators). Two axes of one ball joint turn with it: for both orders the second
+//! line holds.
+
+use plantd_math::eights::{Eight, InEights, in_eights};
+use plantd_math::rows::Block;
+use plantd_math::spatial::{Force, Mat3, Motion, Vec3};
+
+use crate::lagrangian::forces::Instant;
+use crate::lagrangian::momenta::Momenta;
+use crate::model::mechanism::{Forces, Model, PointForce, Potentials, Spring};
+use crate::model::tree::{Joint, WORLD};
+
+/// Takes a wrench, and its change with the motion of the body `(J, J̇)`.
+pub(crate) type Take<'a> = &'a mut dyn FnMut(Force, &dyn Fn(Motion, Motion) -> Force);
+
+/// The wrench of an element on its body, and how it changes.
+pub(crate) trait Field {
+    /// The joint that carries the body.
+    fn joint(&self) -> usize;
+
+    /// Gives the wrench and its change.
+    fn exert(&self, at: &Instant<'_>, take: Take<'_>);
+}
+
+/// A 6 by 6 matrix by columns, and by rows.
+type Both = [[Block; 6]; 2];
+
+/// Sums over a joint and all below it.
+#[derive(Clone, Copy, Debug, Default)]
+struct Sum {
+    wrench: Block,
+    by_motion: Both,
+    by_rate: Both,
+}
+
+/// What a joint gives to the second derivatives.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Given {
+    pub(crate) pull: Block,
+    pub(crate) turn: Block,
+    pub(crate) drag: Block,
+    pub(crate) back: Block,
+}
+
+/// Derivatives of the torque of a ball joint by its own turn and velocity.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct OwnTorque {
+    pub(crate) by_turn: Mat3,
+    pub(crate) by_velocity: Mat3,
+}
+
+/// The elements of a model at one configuration and velocity.
+#[derive(Clone, Debug)]
+pub(crate) struct Fields {
+    /// Of joints on which something acts, or from which several hang; the others pass on what is below them.
+    sums: Vec<Sum>,
+    /// The place of each joint in `sums`, or [`NOWHERE`].
+    places: Vec<usize>,
+    pub(crate) given: Vec<Given>,
+}
+
+/// A joint has no place of its own.
+const NOWHERE: usize = usize::MAX;
+
+/// The wrench of a force at a point.
+pub(crate) fn at_point(p: Vec3, f: Vec3) -> Force {
+    Force { n: p.cross(f), f }
+}
+
+/// Its change when the point moves and the force changes.
+pub(crate) fn change_at_point([p, f]: [Vec3; 2], [moved, changed]: [Vec3; 2]) -> Force {
+    Force { n: moved.cross(f) + p.cross(changed), f: changed }
+}
+
+fn six(Vec3([a, b, c]): Vec3, Vec3([d, e, f]): Vec3) -> Block {
+    Block([a, b, c, d, e, f, 0.0, 0.0])
+}
+
+fn motion(Block([a, b, c, d, e, f, ..]): &Block) -> Motion {
+    Motion { w: Vec3([*a, *b, *c]), v: Vec3([*d, *e, *f]) }
+}
+
+/// A unit of one of the six components.
+fn unit(component: usize) -> Motion {
+    let mut unit = Block::ZERO;
+    unit.0[component] = 1.0;
+    motion(&unit)
+}
+
+/// Adds a column of a matrix, also to its rows.
+fn add(both: &mut Both, column: usize, Force { n, f }: Force) {
+    let [columns, rows] = both;
+    columns[column] = columns[column].plus(six(n, f));
+    for (row, entry) in rows.iter_mut().zip(n.0.into_iter().chain(f.0)) {
+        row.0[column] += entry;
+    }
+}
+
+/// Whether a joint hangs from the one before it.
+fn follows(joint: &Joint, i: usize) -> bool {
+    joint.parent.wrapping_add(1) == i && i > 0
+}
+
+/// Axis and rate of a joint.
+fn motions(momenta: &Momenta, joint: usize) -> [Block; 2] {
+    let Momenta { axis, axis_rate, .. } = momenta;
+    [axis, axis_rate].map(|all| all.get::<f64>(joint)).map(|Motion { w, v }| six(w, v))
+}
+
+impl OwnTorque {
+    /// None.
+    pub(crate) const NONE: Self = Self { by_turn: Mat3::ZERO, by_velocity: Mat3::ZERO };
+}
+
+impl Potentials {
+    fn fields(&self) -> impl Iterator<Item = &dyn Field> {
+        self.springs.iter().filter_map(|spring| match spring {
+            Spring::Point(spring) => Some(spring as &dyn Field),
+            _ => None,
+        })
+    }
+}
+
+impl Forces {
+    fn fields(&self) -> impl Iterator<Item = &dyn Field> {
+        let wrenches = self.wrenches.iter().map(|wrench| wrench as &dyn Field);
+        wrenches.chain(self.point_forces.iter().map(|force| force as &dyn Field))
+    }
+
+    /// Whether some act at poses, and none couple bodies or coordinates.
+    pub(crate) fn are_fields(&self) -> bool {
+        let Self { linear_dampers, path_forces, point_forces, .. } = self;
+        let from_world = |force: &PointForce| force.ends.from_world().is_some();
+        linear_dampers.is_empty() && path_forces.is_empty() && point_forces.iter().all(from_world)
+    }
+}
+
+impl Fields {
+    pub(crate) fn new(model: &Model) -> Self {
+        let joints = &model.dynamics.joints[..];
+        let mut places = vec![NOWHERE; joints.len()];
+        let forces = model.forces.iter().flat_map(Forces::fields);
+        let acted_on = model.potentials.fields().chain(forces).map(|field| field.joint());
+        let apart = joints.iter().enumerate().filter(|(i, joint)| !follows(joint, *i));
+        let (mut count, parents) = (0, apart.map(|(_, joint)| joint.parent));
+        for joint in acted_on.chain(parents) {
+            if let Some(place) = places.get_mut(joint).filter(|place| **place == NOWHERE) {
+                *place = count;
+                count += 1;
+            }
+        }
+        let given = vec![Given::default(); joints.len()];
+        Self { sums: vec![Sum::default(); count], places, given }
+    }
+
+    /// Finds what joints give; forces count `weight` times.
+    pub(crate) fn evaluate(&mut self, model: &Model, at: &Instant<'_>, weight: f64) {
+        self.sums.fill(Sum::default());
+        let springs = model.potentials.fields().map(|field| (field, 1.0));
+        let forces = model.forces.iter().flat_map(Forces::fields).map(|field| (field, weight));
+        for (field, weight) in springs.chain(forces) {
+            let place = self.places.get(field.joint()).copied().unwrap_or(NOWHERE);
+            let Some(sum) = self.sums.get_mut(place) else { continue };
+            let scaled = |Force { n, f }: Force| Force { n: n * weight, f: f * weight };
+            field.exert(at, &mut |wrench, change| {
+                let Force { n, f } = scaled(wrench);
+                sum.wrench = sum.wrench.plus(six(n, f));
+                for component in 0..6 {
+                    let (unit, rest) = (unit(component), Motion::default());
+                    add(&mut sum.by_motion, component, scaled(change(unit, rest)));
+                    add(&mut sum.by_rate, component, scaled(change(rest, unit)));
+                }
+            });
+        }
+        in_eights(Gather { fields: self, at });
+    }
+
+    /// What the axes of a ball joint that begin with `first` have among themselves.
+    pub(crate) fn within_ball(&self, momenta: &Momenta, first: usize) -> OwnTorque {
+        let mut own = OwnTorque::NONE;
+        for (row, column) in (0..9).map(|entry| (entry / 3, entry % 3)) {
+            let Given { turn, back, .. } = &self.given[first + row];
+            let [axis, rate] = motions(momenta, first + column);
+            own.by_turn.0[column].0[row] = Block::dot_of(&axis, turn) + Block::dot_of(&rate, back);
+            own.by_velocity.0[column].0[row] = Block::dot_of(&axis, back);
+        }
+        own
+    }
+}
+
+/// What [`Fields::evaluate`] does once each body has what acts on it.
+struct Gather<'a> {
+    fields: &'a mut Fields,
+    at: &'a Instant<'a>,
+}
+
+impl InEights for Gather<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<E: Eight>(self) {
+        let Self { fields: Fields { sums, places, given }, at } = self;
+        let mut sum = Sum::default();
+        for (i, joint) in at.tree.joints.iter().enumerate().rev() {
+            if let Some(own) = sums.get(places[i]) {
+                sum.add::<E>(own);
+            }
+            let Sum { wrench, by_motion, by_rate } = &sum;
+            let [axis, rate] = &motions(at.momenta, i);
+            let Motion { w: n, v: f } = motion(wrench);
+            let Force { n, f } = motion(axis).cross_force(Force { n, f });
+            let given = &mut given[i];
+            let pull = combined::<E>(&by_motion[0], axis).plus(combined(&by_rate[0], rate));
+            pull.put(&mut given.pull);
+            combined::<E>(&by_motion[1], axis).plus(E::of(&six(n, f))).put(&mut given.turn);
+            combined::<E>(&by_rate[0], axis).put(&mut given.drag);
+            combined::<E>(&by_rate[1], axis).put(&mut given.back);
+            if !follows(joint, i) {
+                if joint.parent != WORLD {
+                    sums[places[joint.parent]].add::<E>(&sum);
+                }
+                sum = Sum::default();
+            }
+        }
+    }
+}
+
+/// The sum of six lines, each times a number.
+#[inline(always)]
+fn combined<E: Eight>(lines: &[Block; 6], numbers: &Block) -> E {
+    let mut sum = E::ZERO;
+    for (line, number) in lines.iter().zip(&numbers.0) {
+        sum = sum.plus(E::of(line).scaled(*number));
+    }
+    sum
+}
+
+impl Sum {
+    #[inline(always)]
+    fn add<E: Eight>(&mut self, o: &Self) {
+        let add = |own: &mut Block, more: &Block| E::of(own).plus(E::of(more)).put(own);
+        add(&mut self.wrench, &o.wrench);
+        for (own, more) in [(&mut self.by_motion, &o.by_motion), (&mut self.by_rate, &o.by_rate)] {
+            let lines = own.as_flattened_mut().iter_mut().zip(more.as_flattened());
+            lines.for_each(|(own, more)| add(own, more));
+        }
+    }
+}
