@@ -23,8 +23,10 @@ const NEARLY: f64 = 1e5;
 const ROUGHLY: f64 = 1e9;
 /// A residual that no longer falls, with a fresh Jacobian, is at its floor if it is below this.
 pub(crate) const FLOOR: f64 = 1e4;
-/// [`FLOOR`] for a Jacobian that was kept.
+/// [`FLOOR`] for a Jacobian that was kept, unless its last correction left no more than this part of a residual: then a
+/// new one would do no better. Long chains have a floor of 1e3 and more, for their momenta are small sums of large terms.
 pub(crate) const CHORD_FLOOR: f64 = 1e2;
+const GOOD: f64 = 1e-4;
 /// Corrections of larger residuals must be seen by the impulse, or energy drifts by a part of them.
 pub(crate) const STALE: f64 = 2.0;
 
@@ -67,7 +69,8 @@ impl<S: Compared> Chord<S> {
     #[inline(always)]
     pub(crate) fn judge(&mut self, size: S, constraint_residual: S) -> S::Truth {
         let [fresh, kept] = [FLOOR, CHORD_FLOOR].map(S::constant);
-        let floor = S::choose(self.is_fresh, fresh, kept);
+        let is_good = self.is_fresh | self.previous.at_most(self.before * GOOD);
+        let floor = S::choose(is_good, fresh, kept);
         let stagnates = (self.previous * 0.5).less(size);
         // Where forces balance, a unit of round-off of a coordinate outweighs the residual's own.
         let is_idle = self.is_idle & constraint_residual.at_most(fresh);

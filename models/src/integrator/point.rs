@@ -41,7 +41,9 @@ impl Point {
         let Dimensions { dynamic, prescribed, .. } = model.dimensions;
         let has_ends = model.held.is_some();
         let is_known = model.planar.is_none() && (model.constraints.is_empty() || has_ends);
-        let pushes = is_known && model.is_of_bodies() && !model.coordinate_inputs.is_empty();
+        // Snapshots of models with springs have none.
+        let is_bare = model.is_of_bodies() && model.potentials.springs.is_empty();
+        let pushes = is_known && is_bare && !model.coordinate_inputs.is_empty();
         let length = Self::length([dynamic, prescribed, model.orientations.len()], has_ends);
         if pushes { Self::zeros(length, has_ends) } else { Self::default() }
     }
