@@ -1,7 +1,9 @@
 //! The linearization against sixth-order central differences of the step itself.
 
-use crate::common::linearization::{check, check_with};
-use crate::common::{builtin, floating, methods, random_tree};
+use crate::common::linearization::{check, check_with, check_within};
+use plantd_models::Model;
+
+use crate::common::{PUSHES, builtin, floating, methods, pulled_rope, random_tree};
 
 #[test]
 fn unconstrained_builtin_scenes() {
@@ -33,6 +35,17 @@ fn random_trees() {
     for seed in 0..24 {
         check(&random_tree(seed));
     }
+}
+
+/// What acts from the world on bodies of a long chain, with equal halves of forces and with those of the paper.
+#[test]
+fn ropes_that_are_pulled_from_the_world() {
+    for scene in ["", PUSHES].map(pulled_rope) {
+        let plan = Model::compile(&scene).unwrap().plan();
+        assert!(plan.contains("by generators, with what acts from the world"), "{plan}");
+        check_within(&scene, 0.3);
+    }
+    check_with(&pulled_rope(PUSHES), |s| s.order = 4);
 }
 
 /// Higher orders and substeps: collocation with forces, prescribed joints and constraints.

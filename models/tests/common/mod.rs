@@ -275,6 +275,80 @@ pub(crate) fn forced_tree(seed: u64) -> Scene {
 }
 
 /// A body that floats freely, with two arms; no gravity.
+/// A rope of rods hinged about x and y by turns, with ball joints on the way and a slide that is moved, and springs of
+/// both between bodies and the world; `more` goes on it. It goes by generators.
+pub(crate) fn pulled_rope(more: &str) -> Scene {
+    let mut text =
+        "format = 1\nname = \"pulled-rope\"\ngravity = [0.5, 0.0, -9.8]\ntime_step_s = 0.01\n"
+            .to_owned();
+    for i in 0..18 {
+        let (parent, z) =
+            if i == 0 { ("world".to_owned(), 0.0) } else { (format!("f{}", i - 1), -0.3) };
+        let joint = match i {
+            5 => "type = \"prismatic\", axis = [0.2, 1.0, 0.1]",
+            8 | 14 => "type = \"ball\"",
+            _ if i % 2 == 0 => "type = \"revolute\", axis = [1.0, 0.0, 0.0]",
+            _ => "type = \"revolute\", axis = [0.0, 1.0, 0.0]",
+        };
+        text += &format!(
+            "[[frames]]\nname = \"f{i}\"\nparent = \"{parent}\"\ntranslation = [0.0, 0.0, {z}]\njoint = {{ {joint} }}\n\
+             body = {{ mass = 0.4, center_of_mass = [0.02, 0.0, -0.15], inertia = [0.02, 0.025, 0.01] }}\n"
+        );
+    }
+    text += r#"
+[[coordinates]]
+name = "f5"
+kind = "prescribed"
+[[springs]]
+type = "two_point"
+a = { frame = "f17", at = [0.0, 0.1, -0.3] }
+b = { frame = "world", at = [0.5, 0.3, -4.0] }
+stiffness = 6.0
+rest_length = 0.4
+[[springs]]
+type = "two_point"
+a = { frame = "world", at = [-0.5, 0.2, -2.0] }
+b = { frame = "f9" }
+stiffness = 4.0
+[[springs]]
+type = "orientation"
+frame = "f8"
+stiffness = 0.7
+"#;
+    Scene::from_toml(&(text + more)).unwrap()
+}
+
+/// What does not come from a potential, for [`pulled_rope`].
+pub(crate) const PUSHES: &str = r#"
+[[inputs]]
+name = "thrust"
+[[forces]]
+type = "two_point_damper"
+a = { frame = "f16", at = [0.0, 0.1, -0.3] }
+b = { frame = "world", at = [0.5, 0.3, -4.0] }
+damping = 0.6
+[[forces]]
+type = "drag"
+frame = "f15"
+at = [0.1, 0.0, -0.2]
+coefficient = 0.3
+[[forces]]
+type = "body_wrench"
+frame = "f14"
+force = [0.3, "thrust", 0.2]
+torque = ["thrust", -0.1, 0.1]
+[[forces]]
+type = "spatial_wrench"
+frame = "f12"
+force = [0.3, "thrust", 0.2]
+torque = ["thrust", -0.1, 0.1]
+[[forces]]
+type = "hybrid_wrench"
+frame = "f17"
+force = [0.3, "thrust", 0.2]
+torque = ["thrust", -0.1, 0.1]
+"#;
+
 pub(crate) fn floating() -> Scene {
     Scene::from_toml(FLOATING).unwrap()
 }
