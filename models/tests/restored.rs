@@ -4,7 +4,7 @@
 use std::sync::Arc;
 
 use crate::common::random_scene::{self, Kind};
-use crate::common::{PUSHES, builtin, methods, pulled_rope};
+use crate::common::{MOVED_BALL, PUSHES, builtin, methods, pulled_rope};
 use plantd_models::{Initial, Linearization, Model, Plant, Precision, Scene, Settings, Snapshot};
 use plantd_scene::{Coordinate, CoordinateKind, Force};
 
@@ -166,7 +166,7 @@ fn chains_that_are_moved_go_on_bit_for_bit() {
 /// The same with what acts on bodies from the world.
 #[test]
 fn ropes_that_are_pulled_go_on_bit_for_bit() {
-    for scene in ["", PUSHES].map(pulled_rope) {
+    for scene in ["", PUSHES, MOVED_BALL].map(pulled_rope) {
         let settings = Settings::new(&Model::compile(&scene).unwrap());
         let mut plant = starts(&scene, settings).unwrap();
         assert!(restored_goes_on(&mut plant, "pulled rope"));

@@ -61,7 +61,7 @@ struct Group {
     kind: GroupKind,
     /// The coordinates of the axes.
     rows: Range<usize>,
-    /// Dynamic and prescribed coordinates of the axes and of all that is below them.
+    /// Where dynamic and prescribed coordinates of the axes, and of all that is below them, are.
     reach: [Range<usize>; 2],
 }
 
@@ -72,8 +72,9 @@ enum GroupKind {
     Single,
     /// Those of a ball joint, with its orientation.
     Ball(usize),
-    /// One whose motion is prescribed: it is not eliminated, and what is below it passes on to its parent as it is.
-    Prescribed,
+    /// Those of a joint whose motion is prescribed, of a ball joint with its orientation: they are not eliminated, and
+    /// what is below them passes on to their parent as it is.
+    Prescribed(Option<usize>),
 }
 
 /// Groups one below the other, with nothing beside them.
@@ -280,11 +281,13 @@ fn limbs(tree: &Tree, nd: usize) -> (Vec<Limb>, Vec<Group>, usize) {
         let begin = groups.len();
         gather(tree, top..end, nd, &mut groups);
         for group in &mut groups[begin..] {
-            // In the order of their coordinates, both.
             for joint in &joints[group.axes.start..ends[lowest]] {
                 let i = joint.coordinate;
                 let reach = &mut group.reach[usize::from(i >= nd)];
-                *reach = if reach.end == 0 { i..i + 1 } else { reach.start..i + 1 };
+                *reach = match reach.end {
+                    0 => i..i + 1,
+                    end => reach.start.min(i)..end.max(i + 1),
+                };
             }
         }
         limbs.push(Limb {
@@ -303,9 +306,12 @@ fn limbs(tree: &Tree, nd: usize) -> (Vec<Limb>, Vec<Group>, usize) {
 /// Groups of axes one below the other, the lowest first; as few as can be, and of like sizes.
 fn gather(tree: &Tree, axes: Range<usize>, nd: usize, groups: &mut Vec<Group>) {
     let kind = |i: usize| match &tree.joints[i] {
-        joint if joint.coordinate >= nd => GroupKind::Prescribed,
         joint => match joint.kind {
+            JointKind::Ball(_) if joint.coordinate >= nd => {
+                GroupKind::Prescribed(Some(joint.orientation))
+            }
             JointKind::Ball(_) => GroupKind::Ball(joint.orientation),
+            _ if joint.coordinate >= nd => GroupKind::Prescribed(None),
             _ => GroupKind::Single,
         },
     };
@@ -318,8 +324,8 @@ fn gather(tree: &Tree, axes: Range<usize>, nd: usize, groups: &mut Vec<Group>) {
     while end > axes.start {
         let own = kind(end - 1);
         let start = match own {
-            GroupKind::Ball(_) => end - 3,
-            GroupKind::Prescribed => end - 1,
+            GroupKind::Ball(_) | GroupKind::Prescribed(Some(_)) => end - 3,
+            GroupKind::Prescribed(None) => end - 1,
             GroupKind::Single => {
                 let others = (axes.start..end).rev().find(|i| kind(*i) != own);
                 others.map_or(axes.start, |i| i + 1)
@@ -437,7 +443,7 @@ impl<const B: usize> SpatialRecursion<B> {
                     *within = own;
                     continue;
                 }
-                GroupKind::Prescribed => continue,
+                GroupKind::Prescribed(_) => continue,
             }
             for (i, axis) in range.zip(&mut *axes) {
                 vectors.single::<E, B>(i).put_lines(axis);
@@ -475,7 +481,7 @@ impl<const B: usize> SpatialRecursion<B> {
                 let is_root = limb.hangs_from.is_none() && at + 1 == limb.groups.end;
                 let axes = &self.axes[group.axes.clone()];
                 watch.see(at, group, axes, carries.then_some(&sums));
-                if group.kind == GroupKind::Prescribed {
+                if matches!(group.kind, GroupKind::Prescribed(_)) {
                     continue;
                 }
                 let sums = &mut sums;
@@ -591,7 +597,7 @@ impl<const B: usize> InEights for Solve<'_, B> {
             };
             for at in limb.groups.clone() {
                 let Group { axes: range, rows, kind, .. } = &groups[at];
-                if *kind == GroupKind::Prescribed {
+                if matches!(kind, GroupKind::Prescribed(_)) {
                     continue;
                 }
                 let inverse = &within[at];
@@ -615,7 +621,7 @@ impl<const B: usize> InEights for Solve<'_, B> {
             };
             for at in limb.groups.clone().rev() {
                 let Group { axes: range, rows, kind, .. } = &groups[at];
-                if *kind == GroupKind::Prescribed {
+                if matches!(kind, GroupKind::Prescribed(_)) {
                     continue;
                 }
                 flow = match (&axes[range.clone()], &mut x[rows.clone()]) {

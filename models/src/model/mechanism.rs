@@ -642,8 +642,8 @@ pub struct OperatingPoint {
 }
 
 impl Model {
-    /// Whether vectors of the joints generate the whole Newton matrix in space: without constraints, what acts between
-    /// two bodies or couples coordinates, and ball joints that are moved.
+    /// Whether vectors of the joints generate the whole Newton matrix in space: without constraints, and what acts
+    /// between two bodies or couples coordinates.
     pub(crate) fn is_generated_in_space(&self) -> bool {
         let d = self.dimensions;
         let of_ball = |i: usize| self.orientations.iter().any(|o| (*o..*o + 3).contains(&i));
@@ -656,7 +656,6 @@ impl Model {
             && self.potentials.springs.iter().all(Spring::is_generated)
             && self.armature.iter().all(|armature| armature.row == armature.column)
             && self.joints_are_in_order()
-            && self.orientations.iter().all(|first| *first < d.dynamic)
     }
 
     /// Whether something acts on bodies from the world, at their poses.
@@ -667,12 +666,12 @@ impl Model {
             || self.potentials.springs.iter().any(|spring| matches!(spring, Spring::Point(_)))
     }
 
-    /// Whether each coordinate has a joint, the dynamic ones in their order, and so the prescribed ones.
+    /// Whether each coordinate has a joint, the dynamic ones in their order.
     fn joints_are_in_order(&self) -> bool {
-        let coordinates = || self.dynamics.joints.iter().map(|joint| joint.coordinate);
-        let dynamic = coordinates().filter(|i| *i < self.dimensions.dynamic);
-        let prescribed = coordinates().filter(|i| *i >= self.dimensions.dynamic);
-        dynamic.chain(prescribed).eq(0..self.dimensions.coordinates())
+        let (d, joints) = (self.dimensions, &self.dynamics.joints);
+        let coordinates = joints.iter().map(|joint| joint.coordinate);
+        let dynamic = coordinates.filter(|i| *i < d.dynamic);
+        dynamic.eq(0..d.dynamic) && joints.len() == d.coordinates()
     }
 
     /// The scene it was compiled from.

@@ -349,6 +349,19 @@ force = [0.3, "thrust", 0.2]
 torque = ["thrust", -0.1, 0.1]
 "#;
 
+/// One of its ball joints is moved.
+pub(crate) const MOVED_BALL: &str = r#"
+[[coordinates]]
+name = "f14_rx"
+kind = "prescribed"
+[[coordinates]]
+name = "f14_ry"
+kind = "prescribed"
+[[coordinates]]
+name = "f14_rz"
+kind = "prescribed"
+"#;
+
 pub(crate) fn floating() -> Scene {
     Scene::from_toml(FLOATING).unwrap()
 }

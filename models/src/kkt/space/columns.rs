@@ -21,9 +21,10 @@
 //! with `G = own + minus · A above`. A row costs 24 products and sums for a column, and 24 more if it is above the
 //! joint of the column.
 //!
-//! A joint whose motion is prescribed has no row and two columns. Each of its ends takes the midpoint half as far, and
+//! A joint whose motion is prescribed has no row and, for each axis, two columns. Each of its ends takes the midpoint half as far, and
 //! the velocity by `∓1/h`, which is what an increment does, and the same with the other sign: `above` and `below` are
-//! `minus` and `lower` by its position at the start, `plus` and `upper` by the next one.
+//! `minus` and `lower` by its position at the start, `plus` and `upper` by the next one. A ball joint turns its midpoint
+//! and changes its velocity by the maps of [`Turning`] in place of a half and `∓1/h`.
 
 use std::ops::Range;
 
@@ -192,9 +193,11 @@ impl<const B: usize> Columns<B> {
                 let Group { axes: range, rows, kind, reach } = &groups[at];
                 any = any || reach.iter().any(|reach| has(reach, 0) || has(reach, n));
                 let (start, margins) = (rows.start, &self.margins[range.clone()]);
-                if let (GroupKind::Prescribed, [own]) = (kind, margins) {
-                    let vectors = [&own.below, &own.push];
-                    add_moved(&mut flow, vectors, [start, n + start], first);
+                if let GroupKind::Prescribed(_) = kind {
+                    for (own, column) in margins.iter().zip(start..) {
+                        let vectors = [&own.below, &own.push];
+                        add_moved(&mut flow, vectors, [column, n + column], first);
+                    }
                     continue;
                 }
                 let increment = &mut self.increment[range.clone()];
@@ -247,9 +250,11 @@ impl<const B: usize> Columns<B> {
             for at in own.clone().rev() {
                 let Group { axes: range, rows: own, kind, .. } = &groups[at];
                 let (start, margins) = (own.start, &self.margins[range.clone()]);
-                if let (GroupKind::Prescribed, [own]) = (kind, margins) {
-                    let vectors = [&own.above, &own.carry];
-                    add_moved(&mut motion, vectors, [start, n + start], first);
+                if let GroupKind::Prescribed(_) = kind {
+                    for (own, column) in margins.iter().zip(start..) {
+                        let vectors = [&own.above, &own.carry];
+                        add_moved(&mut motion, vectors, [column, n + column], first);
+                    }
                     continue;
                 }
                 let group = Lowered {
@@ -402,11 +407,19 @@ impl<E: Eight, const B: usize> Watch<E, B> for Keep<'_, B> {
                 }
                 return;
             }
-            GroupKind::Prescribed => {
-                let [own] = margins else { return };
-                vectors.moved::<E, B>(first).put(own);
-                let Margin { carry, push, above, below } = own;
-                if let Some(sums) = sums {
+            GroupKind::Prescribed(ball) => {
+                match (ball, &mut *margins) {
+                    (Some(ball), [a, b, c]) => {
+                        let [k, l, m] = vectors.moved_ball::<E, B>(first, &own.turnings[ball]);
+                        k.put(a);
+                        l.put(b);
+                        m.put(c);
+                    }
+                    (_, [own, ..]) => vectors.moved::<E, B>(first).put(own),
+                    _ => {}
+                }
+                let Some(sums) = sums else { return };
+                for Margin { carry, push, above, below } in margins {
                     for (above, below) in [(above, below), (carry, push)] {
                         InLine::of(below).plus(combined(&sums.columns, above)).put(below);
                     }

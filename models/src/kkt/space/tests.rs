@@ -5,7 +5,7 @@ use std::sync::Arc;
 use nalgebra::{DMatrix, DVector};
 use plantd_math::simd::{AVX2, AVX512, PORTABLE, within};
 use plantd_math::tree_lu::TreeLu;
-use plantd_scene::{CoordinateKind, Scene, Spring, builtin};
+use plantd_scene::{Coordinate, CoordinateKind, Scene, Spring, builtin};
 
 use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
@@ -325,22 +325,28 @@ fn ball_joints_are_eliminated_with_their_axes() {
     assert!(found < 1e-11, "{found:e}");
 }
 
+/// Some coordinates are moved; what acts on them alone goes.
+fn prescribe(scene: &mut Scene, names: &[&str]) {
+    let is_moved = |name: &str| names.contains(&name);
+    scene.coordinates.retain(|coordinate| !is_moved(&coordinate.name));
+    scene.coordinates.extend(names.iter().map(|name| Coordinate {
+        name: (*name).to_owned(),
+        kind: CoordinateKind::Prescribed,
+        ..Coordinate::default()
+    }));
+    scene.springs.retain(|spring| match spring {
+        Spring::Coordinate { coordinate, .. } => !is_moved(coordinate),
+        _ => true,
+    });
+}
+
 /// The floating hull and a tree that branches, with joints that are moved: at a root, on the way, below a fork and at a
 /// leaf.
 #[test]
 fn joints_that_are_moved_pass_on_what_is_below_them() {
-    let moved = |names: &[&str], text: Model| {
-        let mut scene = text.scene().clone();
-        for coordinate in &mut scene.coordinates {
-            if names.contains(&&*coordinate.name) {
-                coordinate.kind = CoordinateKind::Prescribed;
-                (coordinate.damping, coordinate.armature) = (None, 0.0);
-            }
-        }
-        scene.springs.retain(|spring| match spring {
-            Spring::Coordinate { coordinate, .. } => !names.contains(&&**coordinate),
-            _ => true,
-        });
+    let moved = |names: &[&str], model: Model| {
+        let mut scene = model.scene().clone();
+        prescribe(&mut scene, names);
         Model::compile(&scene).unwrap()
     };
     let tree = "gravity = [1.0, -2.0, -9.0]\ntime_step_s = 0.002";
@@ -349,9 +355,12 @@ fn joints_that_are_moved_pass_on_what_is_below_them() {
         moved(&["f2", "f7", "f9", "f23"], branching(24, tree, "damping = 0.3")),
         moved(&["f0", "f5", "f12", "f13", "f29"], branching(40, tree, "")),
         moved(&["f1", "f5", "f7"], floating()),
+        moved(&["f4_rx", "f4_ry", "f4_rz", "f7"], floating()),
+        moved(&["f2_rx", "f2_ry", "f2_rz", "f8_rx", "f8_ry", "f8_rz"], floating()),
         moved(&["f0", "f40"], compiled(&rope(64, ""))),
     ] {
         let (d, model) = (model.dimensions, Arc::new(model));
+        assert!(d.prescribed > 0);
         let [mut fast, mut slow] = both(&model, 2);
         let mut linear = [Linearization::new(&model), Linearization::new(&model)];
         let mut u = vec![0.4; d.input()];
@@ -414,16 +423,7 @@ fn fields(bodies: [&str; 2]) -> String {
 /// A scene and what acts on it from the world; some coordinates are moved.
 fn pulled(model: &Model, bodies: [&str; 2], more: &str, moved: &[&str]) -> Model {
     let mut scene = Scene::from_toml(&(model.scene().to_toml() + &fields(bodies) + more)).unwrap();
-    for coordinate in &mut scene.coordinates {
-        if moved.contains(&&*coordinate.name) {
-            coordinate.kind = CoordinateKind::Prescribed;
-            (coordinate.damping, coordinate.armature) = (None, 0.0);
-        }
-    }
-    scene.springs.retain(|spring| match spring {
-        Spring::Coordinate { coordinate, .. } => !moved.contains(&&**coordinate),
-        _ => true,
-    });
+    prescribe(&mut scene, moved);
     Model::compile(&scene).unwrap()
 }
 
@@ -440,6 +440,15 @@ fn what_acts_from_the_world_is_generated() {
         ),
         (50, pulled(&floating(), ["f8", "f4"], sprung, &[])),
         (50, pulled(&floating(), ["f7", "f6"], sprung, &["f1", "f5", "f7"])),
+        (
+            50,
+            pulled(
+                &floating(),
+                ["f6", "f8"],
+                "",
+                &["f2_rx", "f2_ry", "f2_rz", "f4_rx", "f4_ry", "f4_rz"],
+            ),
+        ),
         (5, pulled(&compiled(&rope(24, "")), ["f23", "f11"], "", &[])),
     ] {
         let (d, model) = (model.dimensions, Arc::new(model));

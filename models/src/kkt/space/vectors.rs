@@ -12,6 +12,7 @@
 //! which ball joints weigh as they do rates and slopes. Of a joint that is moved, `lower` counts `¼h pull − ½ drag`.
 
 use plantd_math::eights::Eight;
+use plantd_math::spatial::Mat3;
 
 use crate::kkt::space::Added;
 use crate::kkt::space::lines::InLine;
@@ -48,6 +49,9 @@ struct Pulls<E> {
     drag: E,
     back: E,
 }
+
+/// What the axes of a ball joint that is moved give to a column each, above and below, and of what acts from the world.
+type Moved<E> = ([[E; 3]; 3], [[E; 3]; 2], [[E; 3]; 2]);
 
 impl Vectors<'_> {
     #[inline(always)]
@@ -154,6 +158,52 @@ impl Vectors<'_> {
             margin(q, Some(Pulls { pull: pull[1], ..l }), twice[1], above[1]),
             margin(r, Some(Pulls { pull: pull[2], ..m }), twice[2], above[2]),
         ]
+    }
+
+    /// What the axes of a ball joint that is moved give to it.
+    #[inline(always)]
+    pub(crate) fn moved_ball<E: Eight, const B: usize>(
+        &self,
+        first: usize,
+        turning: &Turning,
+    ) -> [Margin<InLine<E, B>>; 3] {
+        let [p, q, r] = self.step.parts_of_ball::<E>(self.curvature, first);
+        let [k, l, m] = [self.pulls::<E>(first), self.pulls(first + 1), self.pulls(first + 2)];
+        let (axis, rate) = ([p.axis, q.axis, r.axis], [p.rate, q.rate, r.rate]);
+        let (force, slope) = ([p.force, q.force, r.force], [p.slope, q.slope, r.slope]);
+        let (pull, drag) = ([k.pull, l.pull, m.pull], [k.drag, l.drag, m.drag]);
+        let h = 1.0 / self.step.inverse;
+        // Rates and slopes are those of half a turn, axes and forces those of a velocity of 1/h.
+        let moved = |(position, velocity): &(Mat3, Mat3)| {
+            let (position, velocity) = (position.scaled(2.0), velocity.scaled(h));
+            (
+                [columns(&position, &rate), columns(&velocity, &axis), columns(&position, &axis)],
+                [columns(&position, &slope), columns(&velocity, &force)],
+                [columns(&position, &pull), columns(&velocity, &drag)],
+            )
+        };
+        let (start, next) = (moved(&turning.by_start), moved(&turning.by_next));
+        let mut all = [Margin {
+            carry: InLine::ZERO,
+            push: InLine::ZERO,
+            above: InLine::ZERO,
+            below: InLine::ZERO,
+        }; 3];
+        for (a, all) in all.iter_mut().enumerate() {
+            let above = |([rate, axis, turned], ..): &Moved<E>| {
+                InLine::new(rate[a].plus(axis[a]), || turned[a])
+            };
+            let below = |(_, [slope, force], [pull, drag]): &Moved<E>| {
+                InLine::new(slope[a].plus(force[a]), || pull[a].plus(drag[a]))
+            };
+            *all = Margin {
+                carry: above(&next),
+                push: below(&next),
+                above: above(&start),
+                below: below(&start),
+            };
+        }
+        all
     }
 
     /// What a joint that is moved gives to it.
