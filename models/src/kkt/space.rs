@@ -305,15 +305,14 @@ fn limbs(tree: &Tree, nd: usize) -> (Vec<Limb>, Vec<Group>, usize) {
 
 /// Groups of axes one below the other, the lowest first; as few as can be, and of like sizes.
 fn gather(tree: &Tree, axes: Range<usize>, nd: usize, groups: &mut Vec<Group>) {
-    let kind = |i: usize| match &tree.joints[i] {
-        joint => match joint.kind {
-            JointKind::Ball(_) if joint.coordinate >= nd => {
-                GroupKind::Prescribed(Some(joint.orientation))
-            }
-            JointKind::Ball(_) => GroupKind::Ball(joint.orientation),
-            _ if joint.coordinate >= nd => GroupKind::Prescribed(None),
-            _ => GroupKind::Single,
-        },
+    let kind = |i: usize| {
+        let joint = &tree.joints[i];
+        let ball = matches!(joint.kind, JointKind::Ball(_)).then_some(joint.orientation);
+        match ball {
+            ball if joint.coordinate >= nd => GroupKind::Prescribed(ball),
+            Some(ball) => GroupKind::Ball(ball),
+            None => GroupKind::Single,
+        }
     };
     let mut push = |axes: Range<usize>, kind| {
         let first = tree.joints[axes.start].coordinate;

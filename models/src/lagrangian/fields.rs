@@ -76,6 +76,8 @@ pub(crate) struct Fields {
     /// The place of each joint in `sums`, or [`NOWHERE`].
     places: Vec<usize>,
     pub(crate) given: Vec<Given>,
+    /// Whether some follow velocities: else `D` is zero, and nobody looks at `drag` and `back`.
+    pub(crate) has_rates: bool,
 }
 
 /// A joint has no place of its own.
@@ -149,8 +151,10 @@ impl Forces {
     /// Whether some act at poses, and none couple bodies or coordinates.
     pub(crate) fn are_fields(&self) -> bool {
         let Self { linear_dampers, path_forces, point_forces, .. } = self;
-        let from_world = |force: &PointForce| force.ends.from_world().is_some();
-        linear_dampers.is_empty() && path_forces.is_empty() && point_forces.iter().all(from_world)
+        let is_from_world = |force: &PointForce| force.ends.moving_end().is_some();
+        linear_dampers.is_empty()
+            && path_forces.is_empty()
+            && point_forces.iter().all(is_from_world)
     }
 }
 
@@ -169,7 +173,8 @@ impl Fields {
             }
         }
         let given = vec![Given::default(); joints.len()];
-        Self { sums: vec![Sum::default(); count], places, given }
+        let has_rates = model.forces.as_ref().is_some_and(|forces| !forces.point_forces.is_empty());
+        Self { sums: vec![Sum::default(); count], places, given, has_rates }
     }
 
     /// Finds what joints give; forces count `weight` times.
@@ -187,7 +192,9 @@ impl Fields {
                 for component in 0..6 {
                     let (unit, rest) = (unit(component), Motion::default());
                     add(&mut sum.by_motion, component, scaled(change(unit, rest)));
-                    add(&mut sum.by_rate, component, scaled(change(rest, unit)));
+                    if self.has_rates {
+                        add(&mut sum.by_rate, component, scaled(change(rest, unit)));
+                    }
                 }
             });
         }
@@ -218,7 +225,7 @@ impl InEights for Gather<'_> {
 
     #[inline(always)]
     fn run<E: Eight>(self) {
-        let Self { fields: Fields { sums, places, given }, at } = self;
+        let Self { fields: Fields { sums, places, given, has_rates }, at } = self;
         let mut sum = Sum::default();
         for (i, joint) in at.tree.joints.iter().enumerate().rev() {
             if let Some(own) = sums.get(places[i]) {
@@ -229,11 +236,14 @@ impl InEights for Gather<'_> {
             let Motion { w: n, v: f } = motion(wrench);
             let Force { n, f } = motion(axis).cross_force(Force { n, f });
             let given = &mut given[i];
-            let pull = combined::<E>(&by_motion[0], axis).plus(combined(&by_rate[0], rate));
-            pull.put(&mut given.pull);
+            let mut pull = combined::<E>(&by_motion[0], axis);
             combined::<E>(&by_motion[1], axis).plus(E::of(&six(n, f))).put(&mut given.turn);
-            combined::<E>(&by_rate[0], axis).put(&mut given.drag);
-            combined::<E>(&by_rate[1], axis).put(&mut given.back);
+            if *has_rates {
+                pull = pull.plus(combined(&by_rate[0], rate));
+                combined::<E>(&by_rate[0], axis).put(&mut given.drag);
+                combined::<E>(&by_rate[1], axis).put(&mut given.back);
+            }
+            pull.put(&mut given.pull);
             if !follows(joint, i) {
                 if joint.parent != WORLD {
                     sums[places[joint.parent]].add::<E>(&sum);

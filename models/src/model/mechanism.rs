@@ -201,7 +201,7 @@ impl Spring {
     fn is_generated(&self) -> bool {
         match self {
             Self::Coordinate(_) | Self::Spline(_) | Self::Stop(_) | Self::Orientation(_) => true,
-            Self::Point(spring) => spring.ends.from_world().is_some(),
+            Self::Point(spring) => spring.ends.moving_end().is_some(),
             Self::Linear(_) => !self.couples_branches(),
             Self::Path(_) => false,
         }
@@ -451,7 +451,7 @@ pub(crate) struct PointPair {
 
 impl PointPair {
     /// The end on a body, where the other one is fixed to the world.
-    pub(crate) fn from_world(&self) -> Option<(&Attachment, Carries)> {
+    pub(crate) fn moving_end(&self) -> Option<(&Attachment, Carries)> {
         match [self.a.joint, self.b.joint] {
             [WORLD, _] => Some((&self.b, Carries::B)),
             [_, WORLD] => Some((&self.a, Carries::A)),

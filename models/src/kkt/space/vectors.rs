@@ -18,7 +18,7 @@ use crate::kkt::space::Added;
 use crate::kkt::space::lines::InLine;
 use crate::lagrangian::curvature::Curvature;
 use crate::lagrangian::fields::{Fields, Given};
-use crate::lagrangian::generators::{Flanks, Generators, Step, columns, of_ball, rows};
+use crate::lagrangian::generators::{Flanks, Generators, Parts, Step, columns, of_ball, rows};
 use crate::lagrangian::turning::{Turning, Weights};
 
 /// What the vectors of a step are made of.
@@ -50,23 +50,70 @@ struct Pulls<E> {
     back: E,
 }
 
-/// What the axes of a ball joint that is moved give to a column each, above and below, and of what acts from the world.
-type Moved<E> = ([[E; 3]; 3], [[E; 3]; 2], [[E; 3]; 2]);
+/// What the axes of a ball joint that is moved give to a column each, of its start or of what is next.
+struct MovedBall<E> {
+    /// Rates and axes, and these as what acts from the world counts them.
+    above: [[E; 3]; 2],
+    below: [[E; 3]; 2],
+}
+
+impl<E: Eight> MovedBall<E> {
+    /// By what a column makes of position and velocity: rates and slopes are those of half a turn, axes and forces
+    /// those of a velocity of `1/h`.
+    #[inline(always)]
+    fn new(
+        [p, q, r]: &[Parts<E>; 3],
+        [k, l, m]: &[Pulls<E>; 3],
+        (position, velocity): &(Mat3, Mat3),
+        h: f64,
+    ) -> Self {
+        let (position, velocity) = (position.scaled(2.0), velocity.scaled(h));
+        let axis = [p.axis, q.axis, r.axis];
+        let (rates, slopes) = ([p.rate, q.rate, r.rate], [p.slope, q.slope, r.slope]);
+        Self {
+            above: [
+                sums(columns(&position, &rates), columns(&velocity, &axis)),
+                columns(&position, &axis),
+            ],
+            below: [
+                sums(columns(&position, &slopes), columns(&velocity, &[p.force, q.force, r.force])),
+                sums(
+                    columns(&position, &[k.pull, l.pull, m.pull]),
+                    columns(&velocity, &[k.drag, l.drag, m.drag]),
+                ),
+            ],
+        }
+    }
+
+    #[inline(always)]
+    fn above<const B: usize>(&self, column: usize) -> InLine<E, B> {
+        InLine::new(self.above[0][column], || self.above[1][column])
+    }
+
+    #[inline(always)]
+    fn below<const B: usize>(&self, column: usize) -> InLine<E, B> {
+        InLine::new(self.below[0][column], || self.below[1][column])
+    }
+}
+
+#[inline(always)]
+fn sums<E: Eight>(a: [E; 3], b: [E; 3]) -> [E; 3] {
+    [a[0].plus(b[0]), a[1].plus(b[1]), a[2].plus(b[2])]
+}
 
 impl Vectors<'_> {
     #[inline(always)]
     fn pulls<E: Eight>(&self, joint: usize) -> Pulls<E> {
         let zero = Pulls { pull: E::ZERO, turn: E::ZERO, drag: E::ZERO, back: E::ZERO };
-        let Some(Fields { given, .. }) = self.added.fields else { return zero };
+        let Some(Fields { given, has_rates, .. }) = self.added.fields else { return zero };
         let Given { pull, turn, drag, back } = &given[joint];
         let Step { motion, half, .. } = self.step;
         let quarter = half * motion;
-        Pulls {
-            pull: E::of(pull).scaled(quarter),
-            turn: E::of(turn).scaled(quarter),
-            drag: E::of(drag).scaled(motion),
-            back: E::of(back).scaled(motion),
+        let (pull, turn) = (E::of(pull).scaled(quarter), E::of(turn).scaled(quarter));
+        if !has_rates {
+            return Pulls { pull, turn, ..zero };
         }
+        Pulls { pull, turn, drag: E::of(drag).scaled(motion), back: E::of(back).scaled(motion) }
     }
 
     /// Of a hinge, a slide or a screw.
@@ -167,43 +214,31 @@ impl Vectors<'_> {
         first: usize,
         turning: &Turning,
     ) -> [Margin<InLine<E, B>>; 3] {
-        let [p, q, r] = self.step.parts_of_ball::<E>(self.curvature, first);
-        let [k, l, m] = [self.pulls::<E>(first), self.pulls(first + 1), self.pulls(first + 2)];
-        let (axis, rate) = ([p.axis, q.axis, r.axis], [p.rate, q.rate, r.rate]);
-        let (force, slope) = ([p.force, q.force, r.force], [p.slope, q.slope, r.slope]);
-        let (pull, drag) = ([k.pull, l.pull, m.pull], [k.drag, l.drag, m.drag]);
+        let parts = self.step.parts_of_ball::<E>(self.curvature, first);
+        let pulls = [self.pulls::<E>(first), self.pulls(first + 1), self.pulls(first + 2)];
         let h = 1.0 / self.step.inverse;
-        // Rates and slopes are those of half a turn, axes and forces those of a velocity of 1/h.
-        let moved = |(position, velocity): &(Mat3, Mat3)| {
-            let (position, velocity) = (position.scaled(2.0), velocity.scaled(h));
-            (
-                [columns(&position, &rate), columns(&velocity, &axis), columns(&position, &axis)],
-                [columns(&position, &slope), columns(&velocity, &force)],
-                [columns(&position, &pull), columns(&velocity, &drag)],
-            )
-        };
-        let (start, next) = (moved(&turning.by_start), moved(&turning.by_next));
-        let mut all = [Margin {
-            carry: InLine::ZERO,
-            push: InLine::ZERO,
-            above: InLine::ZERO,
-            below: InLine::ZERO,
-        }; 3];
-        for (a, all) in all.iter_mut().enumerate() {
-            let above = |([rate, axis, turned], ..): &Moved<E>| {
-                InLine::new(rate[a].plus(axis[a]), || turned[a])
-            };
-            let below = |(_, [slope, force], [pull, drag]): &Moved<E>| {
-                InLine::new(slope[a].plus(force[a]), || pull[a].plus(drag[a]))
-            };
-            *all = Margin {
-                carry: above(&next),
-                push: below(&next),
-                above: above(&start),
-                below: below(&start),
-            };
-        }
-        all
+        let start = MovedBall::new(&parts, &pulls, &turning.by_start, h);
+        let next = MovedBall::new(&parts, &pulls, &turning.by_next, h);
+        [
+            Margin {
+                carry: next.above(0),
+                push: next.below(0),
+                above: start.above(0),
+                below: start.below(0),
+            },
+            Margin {
+                carry: next.above(1),
+                push: next.below(1),
+                above: start.above(1),
+                below: start.below(1),
+            },
+            Margin {
+                carry: next.above(2),
+                push: next.below(2),
+                above: start.above(2),
+                below: start.below(2),
+            },
+        ]
     }
 
     /// What a joint that is moved gives to it.

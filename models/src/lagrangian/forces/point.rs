@@ -111,11 +111,11 @@ impl GeneralizedForce for PointForce {
 
 impl Field for PointForce {
     fn joint(&self) -> usize {
-        self.ends.from_world().map_or(WORLD, |(end, _)| end.joint)
+        self.ends.moving_end().map_or(WORLD, |(end, _)| end.joint)
     }
 
     fn exert(&self, at: &Instant<'_>, take: Take<'_>) {
-        let Some((end, carries)) = self.ends.from_world() else { return };
+        let Some((end, carries)) = self.ends.moving_end() else { return };
         let acting = Acting::new(self, at);
         let (point, force) = match carries {
             Carries::A => (acting.at.a, acting.force),

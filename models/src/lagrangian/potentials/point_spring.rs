@@ -43,11 +43,11 @@ fn stretched<S: Scalar>(spring: &PointSpring, place: Place<'_, S>) -> Stretched<
 
 impl Field for PointSpring {
     fn joint(&self) -> usize {
-        self.ends.from_world().map_or(WORLD, |(end, _)| end.joint)
+        self.ends.moving_end().map_or(WORLD, |(end, _)| end.joint)
     }
 
     fn exert(&self, at: &Instant<'_>, take: Take<'_>) {
-        let Some((_, carries)) = self.ends.from_world() else { return };
+        let Some((_, carries)) = self.ends.moving_end() else { return };
         let Instant { tree, poses, q, .. } = *at;
         let Stretched { at, tension, bend } = stretched(self, Place { tree, poses, q });
         let d = at.difference;
