@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use plantd_math::elimination::SymbolicElimination;
 
-use crate::lagrangian::forces::Instant;
+use crate::lagrangian::instant::Instant;
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
 use crate::model::manifold::orientations;

@@ -6,7 +6,8 @@ use plantd_math::rows::padded;
 use crate::continuous::{Continuous, ContinuousError, ContinuousPoint, take};
 use crate::lagrangian::derivatives::Derivatives;
 use crate::lagrangian::energy::{Energy, energy};
-use crate::lagrangian::forces::{Instant, add_damping, input_forces};
+use crate::lagrangian::forces::{add_damping, input_forces};
+use crate::lagrangian::instant::Instant;
 
 /// The terms of the equation of motion of all coordinates, `n = nd + nk`, at a point:
 ///

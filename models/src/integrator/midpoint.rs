@@ -11,7 +11,7 @@ use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::lagrangian::arrangement::Planar;
 use crate::lagrangian::fields::{Fields, OwnTorque};
-use crate::lagrangian::forces::Instant;
+use crate::lagrangian::instant::Instant;
 use crate::lagrangian::kinematics::Place;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::potentials::Potential as _;

@@ -24,7 +24,7 @@ use plantd_math::spatial::Mat3;
 
 use crate::lagrangian::armature;
 use crate::lagrangian::curvature::Curvature;
-use crate::lagrangian::forces::Instant;
+use crate::lagrangian::instant::Instant;
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
 use crate::model::mechanism::{CoordinateInput, Forces, Model};

@@ -24,7 +24,7 @@ use plantd_math::eights::{Eight, InEights, in_eights};
 use plantd_math::rows::Block;
 use plantd_math::spatial::{Force, Mat3, Motion, Vec3};
 
-use crate::lagrangian::forces::Instant;
+use crate::lagrangian::instant::Instant;
 use crate::lagrangian::momenta::Momenta;
 use crate::model::mechanism::{Forces, Model, PointForce, Potentials, Spring};
 use crate::model::tree::{Joint, WORLD};

@@ -13,10 +13,8 @@ pub(crate) mod wrench;
 
 use plantd_math::scalar::Scalar;
 
-use crate::lagrangian::kinematics::Poses;
-use crate::lagrangian::momenta::Momenta;
+use crate::lagrangian::instant::Instant;
 use crate::model::mechanism::{CoordinateInput, Forces};
-use crate::model::tree::Tree;
 
 /// Writes the input forces of a step; they do not change within it.
 #[inline(never)]
@@ -38,20 +36,6 @@ pub(crate) fn add_damping<S: Scalar>(
     for (((total, input), c), v) in total.iter_mut().zip(input).zip(damping).zip(velocity) {
         *total = *input - *v * *c;
     }
-}
-
-/// Where and how fast a mechanism is, and its inputs: what forces depend on.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Instant<'a, S: Scalar = f64> {
-    pub(crate) tree: &'a Tree,
-    pub(crate) poses: &'a Poses<S>,
-    /// With axes and twists of the same configuration and velocity.
-    pub(crate) momenta: &'a Momenta<S>,
-    /// Of all coordinates.
-    pub(crate) q: &'a [S],
-    /// Of all coordinates.
-    pub(crate) velocity: &'a [S],
-    pub(crate) inputs: &'a [S],
 }
 
 /// A generalized force `f(q, v, u)`.

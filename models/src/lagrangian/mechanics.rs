@@ -7,7 +7,7 @@ use plantd_math::tree_lu::TreeLu;
 
 use crate::lagrangian::arrangement::Planar;
 use crate::lagrangian::curvature::{Curvature, Entry, SecondDerivatives};
-use crate::lagrangian::forces::Instant;
+use crate::lagrangian::instant::Instant;
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
 use crate::lagrangian::planar::{PlanarTree, Slopes};

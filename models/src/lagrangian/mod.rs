@@ -12,6 +12,7 @@ pub(crate) mod energy;
 pub(crate) mod fields;
 pub(crate) mod forces;
 pub(crate) mod generators;
+pub(crate) mod instant;
 pub(crate) mod kinematics;
 pub(crate) mod mechanics;
 pub(crate) mod momenta;

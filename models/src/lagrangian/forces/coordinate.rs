@@ -2,7 +2,8 @@
 
 use plantd_math::scalar::Scalar;
 
-use crate::lagrangian::forces::{GeneralizedForce, Instant};
+use crate::lagrangian::forces::GeneralizedForce;
+use crate::lagrangian::instant::Instant;
 use crate::model::mechanism::{CoordinateForce, CoordinateLaw};
 
 impl GeneralizedForce for CoordinateForce {

@@ -8,7 +8,8 @@
 
 use plantd_math::scalar::Scalar;
 
-use crate::lagrangian::forces::{GeneralizedForce, Instant};
+use crate::lagrangian::forces::GeneralizedForce;
+use crate::lagrangian::instant::Instant;
 use crate::model::mechanism::{LinearDamper, LinearLaw};
 
 /// `force tanh(s / velocity)` and its slope.

@@ -10,8 +10,9 @@
 
 use plantd_math::scalar::Scalar;
 
+use crate::lagrangian::forces::GeneralizedForce;
 use crate::lagrangian::forces::linear_damper::friction;
-use crate::lagrangian::forces::{GeneralizedForce, Instant};
+use crate::lagrangian::instant::Instant;
 use crate::lagrangian::vectors::Distance;
 use crate::model::mechanism::{PathForce, PointPair, Resistance};
 

@@ -12,7 +12,8 @@ use plantd_math::scalar::Scalar;
 use plantd_math::spatial::{Motion, Vec3};
 
 use crate::lagrangian::fields::{Field, Take, at_point, change_at_point};
-use crate::lagrangian::forces::{GeneralizedForce, Instant};
+use crate::lagrangian::forces::GeneralizedForce;
+use crate::lagrangian::instant::Instant;
 use crate::lagrangian::vectors::Separation;
 use crate::model::mechanism::{Carries, PathJoint, PointForce, PointLaw};
 use crate::model::tree::{Attachment, JointKind, WORLD};

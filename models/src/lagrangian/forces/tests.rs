@@ -5,6 +5,8 @@ use plantd_math::spatial::{Mat3, Vec3};
 use plantd_scene::Scene;
 
 use crate::lagrangian::forces::*;
+use crate::lagrangian::kinematics::Poses;
+use crate::lagrangian::momenta::Momenta;
 use crate::model::mechanism::Model;
 
 /// Every force, on a tree with oblique hinges and slides and a ball joint; `shaken` is prescribed.

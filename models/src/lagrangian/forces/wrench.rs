@@ -15,7 +15,8 @@ use plantd_math::scalar::Scalar;
 use plantd_math::spatial::{Force, Vec3};
 
 use crate::lagrangian::fields::{Field, Take};
-use crate::lagrangian::forces::{GeneralizedForce, Instant};
+use crate::lagrangian::forces::GeneralizedForce;
+use crate::lagrangian::instant::Instant;
 use crate::model::mechanism::{Wrench, WrenchKind};
 
 impl Wrench {

@@ -11,7 +11,7 @@ use plantd_math::scalar::Scalar;
 use plantd_math::spatial::Vec3;
 
 use crate::lagrangian::fields::{Field, Take, at_point, change_at_point};
-use crate::lagrangian::forces::Instant;
+use crate::lagrangian::instant::Instant;
 use crate::lagrangian::kinematics::Place;
 use crate::lagrangian::potentials::Potential;
 use crate::lagrangian::vectors::Separation;
