@@ -66,7 +66,11 @@ impl State {
             let (sessions, has_more) = hub.page(&after, 100);
             let Some(last) = sessions.last() else { return are_written };
             after = last.id().to_owned();
-            let changed = sessions.iter().filter_map(|each| self.changed(hub, each)).collect();
+            // Where servers share a store a new plant is first written by who makes it, who is told if it is another's.
+            let is_claimed =
+                |each: &&Arc<Session>| self.shared().is_none() || each.kept().is_some();
+            let claimed = sessions.iter().filter(is_claimed);
+            let changed = claimed.filter_map(|each| self.changed(hub, each)).collect();
             are_written &= self.save_changed(hub, changed);
             if !has_more {
                 return are_written;
