@@ -274,7 +274,7 @@ fn limbs(tree: &Tree, nd: usize) -> (Vec<Limb>, Vec<Group>, usize) {
     while end > 0 {
         let lowest = end - 1;
         let mut top = lowest;
-        while joints[top].parent.checked_add(1) == Some(top) && children[top - 1] == 1 {
+        while joints[top].follows(top) && children[top - 1] == 1 {
             top -= 1;
         }
         let parent = joints[top].parent;

@@ -27,7 +27,7 @@ use plantd_math::spatial::{Force, Mat3, Motion, Vec3};
 use crate::lagrangian::instant::Instant;
 use crate::lagrangian::momenta::Momenta;
 use crate::model::mechanism::{Forces, Model, PointForce, Potentials, Spring};
-use crate::model::tree::{Joint, WORLD};
+use crate::model::tree::WORLD;
 
 /// Takes a wrench, and its change with the motion of the body `(J, J̇)`.
 pub(crate) type Take<'a> = &'a mut dyn FnMut(Force, &dyn Fn(Motion, Motion) -> Force);
@@ -117,11 +117,6 @@ fn add(both: &mut Both, column: usize, Force { n, f }: Force) {
     }
 }
 
-/// Whether a joint hangs from the one before it.
-fn follows(joint: &Joint, i: usize) -> bool {
-    joint.parent.wrapping_add(1) == i && i > 0
-}
-
 /// Axis and rate of a joint.
 fn motions(momenta: &Momenta, joint: usize) -> [Block; 2] {
     let Momenta { axis, axis_rate, .. } = momenta;
@@ -131,6 +126,20 @@ fn motions(momenta: &Momenta, joint: usize) -> [Block; 2] {
 impl OwnTorque {
     /// None.
     pub(crate) const NONE: Self = Self { by_turn: Mat3::ZERO, by_velocity: Mat3::ZERO };
+}
+
+impl Model {
+    /// What acts on bodies from the world, at their poses, where nothing acts between bodies; and what each counts,
+    /// where forces count `weight` times.
+    fn fields(&self, weight: f64) -> impl Iterator<Item = (&dyn Field, f64)> {
+        let springs = self.potentials.fields().map(|field| (field, 1.0));
+        springs.chain(self.forces.iter().flat_map(Forces::fields).map(move |field| (field, weight)))
+    }
+
+    /// Whether something does.
+    pub(crate) fn has_fields(&self) -> bool {
+        self.fields(1.0).next().is_some()
+    }
 }
 
 impl Potentials {
@@ -162,9 +171,8 @@ impl Fields {
     pub(crate) fn new(model: &Model) -> Self {
         let joints = &model.dynamics.joints[..];
         let mut places = vec![NOWHERE; joints.len()];
-        let forces = model.forces.iter().flat_map(Forces::fields);
-        let acted_on = model.potentials.fields().chain(forces).map(|field| field.joint());
-        let apart = joints.iter().enumerate().filter(|(i, joint)| !follows(joint, *i));
+        let acted_on = model.fields(1.0).map(|(field, _)| field.joint());
+        let apart = joints.iter().enumerate().filter(|(i, joint)| !joint.follows(*i));
         let (mut count, parents) = (0, apart.map(|(_, joint)| joint.parent));
         for joint in acted_on.chain(parents) {
             if let Some(place) = places.get_mut(joint).filter(|place| **place == NOWHERE) {
@@ -180,9 +188,7 @@ impl Fields {
     /// Finds what joints give; forces count `weight` times.
     pub(crate) fn evaluate(&mut self, model: &Model, at: &Instant<'_>, weight: f64) {
         self.sums.fill(Sum::default());
-        let springs = model.potentials.fields().map(|field| (field, 1.0));
-        let forces = model.forces.iter().flat_map(Forces::fields).map(|field| (field, weight));
-        for (field, weight) in springs.chain(forces) {
+        for (field, weight) in model.fields(weight) {
             let place = self.places.get(field.joint()).copied().unwrap_or(NOWHERE);
             let Some(sum) = self.sums.get_mut(place) else { continue };
             let scaled = |Force { n, f }: Force| Force { n: n * weight, f: f * weight };
@@ -244,7 +250,7 @@ impl InEights for Gather<'_> {
                 combined::<E>(&by_rate[1], axis).put(&mut given.back);
             }
             pull.put(&mut given.pull);
-            if !follows(joint, i) {
+            if !joint.follows(i) {
                 if joint.parent != WORLD {
                     sums[places[joint.parent]].add::<E>(&sum);
                 }

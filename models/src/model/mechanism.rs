@@ -254,8 +254,13 @@ impl Forces {
 
     /// Whether they are more than forces on single coordinates, none of them of a ball joint.
     pub(crate) fn need_poses(&self, orientations: &[usize]) -> bool {
+        self.coupling() > 0 || self.act_on_balls(orientations)
+    }
+
+    /// Whether some act on single coordinates of ball joints.
+    fn act_on_balls(&self, orientations: &[usize]) -> bool {
         let of_ball = |i: usize| orientations.iter().any(|first| (*first..first + 3).contains(&i));
-        self.coupling() > 0 || self.coordinate_forces.iter().any(|force| of_ball(force.coordinate))
+        self.coordinate_forces.iter().any(|force| of_ball(force.coordinate))
     }
 }
 
@@ -646,24 +651,14 @@ impl Model {
     /// between two bodies or couples coordinates.
     pub(crate) fn is_generated_in_space(&self) -> bool {
         let d = self.dimensions;
-        let of_ball = |i: usize| self.orientations.iter().any(|o| (*o..*o + 3).contains(&i));
-        let are_generated = |forces: &Forces| {
-            forces.are_fields() && !forces.coordinate_forces.iter().any(|f| of_ball(f.coordinate))
-        };
+        let are_generated =
+            |forces: &Forces| forces.are_fields() && !forces.act_on_balls(&self.orientations);
         self.planar.is_none()
             && d.constraints == 0
             && self.forces.as_ref().is_none_or(are_generated)
             && self.potentials.springs.iter().all(Spring::is_generated)
             && self.armature.iter().all(|armature| armature.row == armature.column)
             && self.joints_are_in_order()
-    }
-
-    /// Whether something acts on bodies from the world, at their poses.
-    pub(crate) fn has_fields(&self) -> bool {
-        let at_points =
-            |forces: &Forces| !forces.wrenches.is_empty() || !forces.point_forces.is_empty();
-        self.forces.as_ref().is_some_and(at_points)
-            || self.potentials.springs.iter().any(|spring| matches!(spring, Spring::Point(_)))
     }
 
     /// Whether each coordinate has a joint, the dynamic ones in their order.

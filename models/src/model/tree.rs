@@ -135,6 +135,13 @@ impl Fixed<Block> {
     }
 }
 
+impl Joint {
+    /// Whether it hangs from the one before it, where it is the one at `i`.
+    pub(crate) fn follows(&self, i: usize) -> bool {
+        self.parent.checked_add(1) == Some(i)
+    }
+}
+
 impl Tree {
     /// What is fixed to the joints that begin with `i`, side by side.
     #[inline(always)]

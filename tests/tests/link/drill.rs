@@ -15,7 +15,9 @@ use plantd_client::{Client, v1};
 use plantd_proto::link::{DomainError, SHARED_MEMORY_DIRECTORY};
 use plantd_server::wire::link::config::LinkConfig;
 use plantd_server::wire::link::host::{LinkError as HostError, LinkHost};
-use plantd_tests::links::{ChildProcess, LinkFixture, PATIENCE, PLANT, files_of_links, wait_until};
+use plantd_tests::links::{
+    ChildProcess, LinkFixture, PATIENCE, PLANT, files_of_links, patient, wait_until,
+};
 use plantd_tests::server::ServerProcess;
 
 const PLANTS: [&str; 3] = ["one", "two", "three"];
@@ -72,9 +74,7 @@ impl House {
 }
 
 fn connect(root: &Path, plant: &str, connect_timeout: Duration) -> Result<LinkDriver, LinkError> {
-    let root = root.to_owned();
-    let options =
-        LinkOptions { root, timeout: PATIENCE, connect_timeout, ..LinkOptions::default() };
+    let options = LinkOptions { connect_timeout, ..patient(root) };
     tokio::task::block_in_place(|| LinkDriver::connect(plant, options))
 }
 

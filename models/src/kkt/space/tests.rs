@@ -305,9 +305,6 @@ fn ball_joints_are_eliminated_with_their_axes() {
         fast.step_and_linearize(&[0.7], &mut linear[0]).unwrap();
         slow.step_and_linearize(&[0.7], &mut linear[1]).unwrap();
     }
-    let apart = |a: &[f64], b: &[f64]| {
-        a.iter().zip(b).fold(0.0_f64, |most, (a, b)| most.max((a - b).abs()))
-    };
     assert!(apart(fast.q(), slow.q()) < 1e-10, "{:e}", apart(fast.q(), slow.q()));
     let [a, b] = linear.map(|l| l.a());
     assert!((&a - &b).amax() <= 1e-9 * b.amax(), "{:e} {:e}", (&a - &b).amax(), b.amax());
@@ -323,6 +320,32 @@ fn ball_joints_are_eliminated_with_their_axes() {
     workspace.find_velocity(&model, &state);
     let found = apart(&velocity, &workspace.residual.dynamics[..n]);
     assert!(found < 1e-11, "{found:e}");
+}
+
+/// Moves a plant by generators and one entry by entry, with what is moved going to and fro, and compares where they are
+/// and their last linearizations; returns the first one.
+fn move_alike(model: &Arc<Model>, steps: u32) -> Plant {
+    let d = model.dimensions;
+    let [mut fast, mut slow] = both(model, 2);
+    let mut linear = [Linearization::new(model), Linearization::new(model)];
+    let mut u = vec![0.4; d.input()];
+    let start: Vec<f64> = fast.q()[d.dynamic..].to_vec();
+    for k in 0..steps {
+        for (i, start) in start.iter().enumerate() {
+            u[d.inputs + i] = start + 0.1 * (0.05 * f64::from(k + 1) * (1.0 + wave(i))).sin();
+        }
+        fast.step_and_linearize(&u, &mut linear[0]).unwrap();
+        slow.step_and_linearize(&u, &mut linear[1]).unwrap();
+    }
+    assert!(apart(fast.q(), slow.q()) < 1e-9, "{:e}", apart(fast.q(), slow.q()));
+    for [a, b] in [linear.each_ref().map(|l| l.a()), linear.each_ref().map(|l| l.b())] {
+        assert!((&a - &b).amax() <= 1e-9 * b.amax(), "{:e} {:e}", (&a - &b).amax(), b.amax());
+    }
+    fast
+}
+
+fn apart(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).fold(0.0_f64, |most, (a, b)| most.max((a - b).abs()))
 }
 
 /// Some coordinates are moved; what acts on them alone goes.
@@ -361,25 +384,7 @@ fn joints_that_are_moved_pass_on_what_is_below_them() {
     ] {
         let (d, model) = (model.dimensions, Arc::new(model));
         assert!(d.prescribed > 0);
-        let [mut fast, mut slow] = both(&model, 2);
-        let mut linear = [Linearization::new(&model), Linearization::new(&model)];
-        let mut u = vec![0.4; d.input()];
-        let start: Vec<f64> = fast.q()[d.dynamic..].to_vec();
-        for k in 0..50 {
-            for (i, start) in start.iter().enumerate() {
-                u[d.inputs + i] = start + 0.1 * (0.05 * f64::from(k + 1) * (1.0 + wave(i))).sin();
-            }
-            fast.step_and_linearize(&u, &mut linear[0]).unwrap();
-            slow.step_and_linearize(&u, &mut linear[1]).unwrap();
-        }
-        let apart = |a: &[f64], b: &[f64]| {
-            a.iter().zip(b).fold(0.0_f64, |most, (a, b)| most.max((a - b).abs()))
-        };
-        assert!(apart(fast.q(), slow.q()) < 1e-9, "{:e}", apart(fast.q(), slow.q()));
-        let [a, b] = linear.each_ref().map(|l| l.a());
-        assert!((&a - &b).amax() <= 1e-9 * b.amax(), "{:e} {:e}", (&a - &b).amax(), b.amax());
-        let [a, b] = linear.each_ref().map(|l| l.b());
-        assert!((&a - &b).amax() <= 1e-9 * b.amax(), "{:e} {:e}", (&a - &b).amax(), b.amax());
+        let mut fast = move_alike(&model, 50);
         let workspace = &mut fast.workspace;
         assert!(workspace.find_velocity_by_recursion(&model, &fast.settings, &fast.state));
         let velocity = workspace.residual.dynamics.clone();
@@ -451,26 +456,9 @@ fn what_acts_from_the_world_is_generated() {
         ),
         (5, pulled(&compiled(&rope(24, "")), ["f23", "f11"], "", &[])),
     ] {
-        let (d, model) = (model.dimensions, Arc::new(model));
+        let model = Arc::new(model);
         assert!(model.has_fields());
-        let [mut fast, mut slow] = both(&model, 2);
-        let mut linear = [Linearization::new(&model), Linearization::new(&model)];
-        let mut u = vec![0.4; d.input()];
-        let start: Vec<f64> = fast.q()[d.dynamic..].to_vec();
-        for k in 0..steps {
-            for (i, start) in start.iter().enumerate() {
-                u[d.inputs + i] = start + 0.1 * (0.05 * f64::from(k + 1) * (1.0 + wave(i))).sin();
-            }
-            fast.step_and_linearize(&u, &mut linear[0]).unwrap();
-            slow.step_and_linearize(&u, &mut linear[1]).unwrap();
-        }
-        for (a, b) in fast.q().iter().zip(slow.q()) {
-            assert!((a - b).abs() < 1e-9, "{} {a} {b}", model.scene().name);
-        }
-        let [a, b] = linear.each_ref().map(|l| l.a());
-        assert!((&a - &b).amax() <= 1e-9 * b.amax(), "{:e} {:e}", (&a - &b).amax(), b.amax());
-        let [a, b] = linear.each_ref().map(|l| l.b());
-        assert!((&a - &b).amax() <= 1e-9 * b.amax(), "{:e} {:e}", (&a - &b).amax(), b.amax());
+        let mut fast = move_alike(&model, steps);
         let (workspace, settings) = (&mut fast.workspace, &fast.settings);
         workspace.fill_newton_matrix(&model, settings);
         let matrix = dense(&model, &workspace.kkt.factored.tree);
