@@ -43,6 +43,7 @@ pub use crate::integrator::settings::{
 };
 pub use crate::integrator::state::State;
 pub use crate::lagrangian::energy::Energy;
+pub use crate::linearization::derivative::StepDerivative;
 pub use crate::linearization::linearize::Linearization;
 pub use crate::linearization::matrices::Layout;
 pub use crate::linearization::second_order::contraction::Contraction;

@@ -9,7 +9,7 @@ use crate::integrator::response::Response;
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::kkt::planar::Diagonals;
-use crate::kkt::space::columns::OfBall;
+use crate::kkt::space::margins::OfBall;
 use crate::kkt::system::KktSystem;
 use crate::lagrangian::generators::Flanks;
 use crate::lagrangian::nudge::Nudge;

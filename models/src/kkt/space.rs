@@ -21,7 +21,10 @@
 //! loses digits in long chains (up to 1e-11 of it in one of 64 hinges), which the next correction makes good.
 
 pub(crate) mod columns;
+pub(crate) mod derivatives;
 mod lines;
+pub(crate) mod margins;
+mod products;
 #[cfg(test)]
 mod tests;
 mod vectors;
@@ -43,6 +46,9 @@ use crate::model::tree::{JointKind, Tree};
 
 /// Axes that are eliminated at once, at most.
 const WIDEST: usize = 3;
+
+/// A matrix of the axes of a group, by rows.
+type Square = [[f64; WIDEST]; WIDEST];
 
 /// What is added to the second derivatives of the Lagrangian.
 #[derive(Clone, Copy, Debug)]
@@ -105,7 +111,7 @@ pub(crate) struct SpatialRecursion<const B: usize> {
     /// Of axes that have been eliminated, `U` and `D⁻¹ W` stand in the place of `upper` and `lower`.
     axes: Vec<Generators<Line<B>>>,
     /// `K` of each group by itself; once it is eliminated, `D⁻¹`.
-    within: Vec<[[f64; WIDEST]; WIDEST]>,
+    within: Vec<Square>,
     /// `A` and its transpose, by rows, where limbs meet. As trees are walked depth first, there are few, which
     /// stay in the nearest cache.
     sums: Vec<Kept<B>>,
@@ -507,7 +513,7 @@ impl<const B: usize> SpatialRecursion<B> {
 fn write_within<E: Eight, const B: usize, const W: usize>(
     axes: [&Generators<Line<B>>; W],
     diagonal: &[f64],
-    within: &mut [[f64; WIDEST]; WIDEST],
+    within: &mut Square,
 ) {
     for (a, above) in axes.iter().enumerate() {
         let (minus, plus) = (InLine::<E, B>::of(&above.minus), InLine::<E, B>::of(&above.plus));
@@ -523,7 +529,7 @@ fn write_within<E: Eight, const B: usize, const W: usize>(
 #[inline(always)]
 fn eliminate<E: Eight, const B: usize, const W: usize>(
     axes: [&mut Generators<Line<B>>; W],
-    within: &mut [[f64; WIDEST]; WIDEST],
+    within: &mut Square,
     sums: &mut Sums<E, B>,
     carries: bool,
     is_root: bool,
@@ -589,23 +595,39 @@ impl<const B: usize> InEights for Solve<'_, B> {
     fn run<E: Eight>(self) {
         let Self { recursion, x } = self;
         let SpatialRecursion { limbs, groups, axes, within, flows, .. } = recursion;
-        for limb in &*limbs {
+        let tree = Limbs { limbs, groups };
+        tree.ascend::<E, B>(flows, &mut Lift { axes, within, x: &mut *x });
+        tree.descend::<E, B>(flows, &mut Lower { axes, x });
+    }
+}
+
+/// Limbs and their groups.
+#[derive(Clone, Copy)]
+struct Limbs<'a> {
+    limbs: &'a [Limb],
+    groups: &'a [Group],
+}
+
+/// What a group of axes makes of the flow that comes to it, from below or from above.
+trait Passage<E, const B: usize> {
+    fn pass(&mut self, at: usize, group: &Group, flow: InLine<E, B>) -> InLine<E, B>;
+}
+
+impl Limbs<'_> {
+    /// From the leaves to the root; `flows` are those where limbs meet.
+    #[inline(always)]
+    fn ascend<E: Eight, const B: usize>(
+        self,
+        flows: &mut [Line<B>],
+        through: &mut impl Passage<E, B>,
+    ) {
+        for limb in self.limbs {
             let mut flow = match limb.carries {
                 Some(place) => InLine::<E, B>::of(&flows[place]),
                 None => InLine::ZERO,
             };
             for at in limb.groups.clone() {
-                let Group { axes: range, rows, kind, .. } = &groups[at];
-                if matches!(kind, GroupKind::Prescribed(_)) {
-                    continue;
-                }
-                let inverse = &within[at];
-                flow = match (&axes[range.clone()], &mut x[rows.clone()]) {
-                    ([a], [x]) => lift([a], [x], inverse, flow),
-                    ([a, b], [x, y]) => lift([a, b], [x, y], inverse, flow),
-                    ([a, b, c], [x, y, z]) => lift([a, b, c], [x, y, z], inverse, flow),
-                    _ => flow,
-                };
+                flow = through.pass(at, &self.groups[at], flow);
             }
             if let Some(Fork { place, is_first }) = limb.hangs_from {
                 let all = &mut flows[place];
@@ -613,26 +635,72 @@ impl<const B: usize> InEights for Solve<'_, B> {
                 flow.put(all);
             }
         }
-        for limb in limbs.iter().rev() {
+    }
+
+    /// From the root to the leaves.
+    #[inline(always)]
+    fn descend<E: Eight, const B: usize>(
+        self,
+        flows: &mut [Line<B>],
+        through: &mut impl Passage<E, B>,
+    ) {
+        for limb in self.limbs.iter().rev() {
             let mut flow = match limb.hangs_from {
                 Some(fork) => InLine::<E, B>::of(&flows[fork.place]),
                 None => InLine::ZERO,
             };
             for at in limb.groups.clone().rev() {
-                let Group { axes: range, rows, kind, .. } = &groups[at];
-                if matches!(kind, GroupKind::Prescribed(_)) {
-                    continue;
-                }
-                flow = match (&axes[range.clone()], &mut x[rows.clone()]) {
-                    ([a], [x]) => lower([a], [x], flow),
-                    ([a, b], [x, y]) => lower([a, b], [x, y], flow),
-                    ([a, b, c], [x, y, z]) => lower([a, b, c], [x, y, z], flow),
-                    _ => flow,
-                };
+                flow = through.pass(at, &self.groups[at], flow);
             }
             if let Some(place) = limb.carries {
                 flow.put(&mut flows[place]);
             }
+        }
+    }
+}
+
+/// Eliminates right-hand sides on the way up.
+struct Lift<'a, const B: usize> {
+    axes: &'a [Generators<Line<B>>],
+    within: &'a [Square],
+    x: &'a mut [f64],
+}
+
+impl<E: Eight, const B: usize> Passage<E, B> for Lift<'_, B> {
+    #[inline(always)]
+    fn pass(&mut self, at: usize, group: &Group, flow: InLine<E, B>) -> InLine<E, B> {
+        let Group { axes, rows, kind, .. } = group;
+        if matches!(kind, GroupKind::Prescribed(_)) {
+            return flow;
+        }
+        let inverse = &self.within[at];
+        match (&self.axes[axes.clone()], &mut self.x[rows.clone()]) {
+            ([a], [x]) => lift([a], [x], inverse, flow),
+            ([a, b], [x, y]) => lift([a, b], [x, y], inverse, flow),
+            ([a, b, c], [x, y, z]) => lift([a, b, c], [x, y, z], inverse, flow),
+            _ => flow,
+        }
+    }
+}
+
+/// Puts in what is above, on the way down.
+struct Lower<'a, const B: usize> {
+    axes: &'a [Generators<Line<B>>],
+    x: &'a mut [f64],
+}
+
+impl<E: Eight, const B: usize> Passage<E, B> for Lower<'_, B> {
+    #[inline(always)]
+    fn pass(&mut self, _: usize, group: &Group, flow: InLine<E, B>) -> InLine<E, B> {
+        let Group { axes, rows, kind, .. } = group;
+        if matches!(kind, GroupKind::Prescribed(_)) {
+            return flow;
+        }
+        match (&self.axes[axes.clone()], &mut self.x[rows.clone()]) {
+            ([a], [x]) => lower([a], [x], flow),
+            ([a, b], [x, y]) => lower([a, b], [x, y], flow),
+            ([a, b, c], [x, y, z]) => lower([a, b, c], [x, y, z], flow),
+            _ => flow,
         }
     }
 }
@@ -642,7 +710,7 @@ impl<const B: usize> InEights for Solve<'_, B> {
 fn lift<E: Eight, const B: usize, const W: usize>(
     axes: [&Generators<Line<B>>; W],
     x: [&mut f64; W],
-    inverse: &[[f64; WIDEST]; WIDEST],
+    inverse: &Square,
     flow: InLine<E, B>,
 ) -> InLine<E, B> {
     let mut b = [0.0; W];

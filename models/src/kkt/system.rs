@@ -15,7 +15,8 @@ use crate::kkt::held::HeldLimbs;
 use crate::kkt::loops::{Mechanism, Multifrontal, Scales};
 use crate::kkt::planar::PlanarRecursion;
 use crate::kkt::schur::SchurComplement;
-use crate::kkt::space::columns::{InSpace, Own, Rows};
+use crate::kkt::space::derivatives::Derivatives;
+use crate::kkt::space::margins::Own;
 use crate::kkt::space::{Added, Spatial};
 use crate::lagrangian::fields::Fields;
 use crate::lagrangian::generators::MatrixKind;
@@ -40,7 +41,7 @@ pub(crate) struct KktSystem {
     /// What acts on bodies from the world, where generators have that.
     pub(crate) fields: Option<Box<Fields>>,
     /// For linearizations by generators in space.
-    pub(crate) in_space: Option<Box<InSpace>>,
+    pub(crate) in_space: Option<Derivatives>,
 }
 
 /// Factors of `K`.
@@ -125,9 +126,8 @@ impl KktSystem {
         let nd = model.dimensions.dynamic;
         let entries = model.elimination.entries();
         let in_space = (model.is_generated_in_space())
-            .then(|| InSpace::new(model))
-            .filter(|own| own.is_faster(entries))
-            .map(Box::new);
+            .then(|| Derivatives::new(model))
+            .filter(|own| own.is_faster(entries));
         let is_generated = in_space.is_some() || model.solver == Solver::Spatial;
         let fields = (is_generated && model.has_fields()).then(|| Box::new(Fields::new(model)));
         Self {
@@ -222,22 +222,21 @@ impl KktSystem {
         }
     }
 
-    /// Factors by generators in space at the last second derivatives, and writes the derivatives of the step; false
-    /// where there is no room for that. The error is a pivot that is too small.
-    pub(crate) fn linearize_in_space(
+    /// Factors by generators in space at the last second derivatives, for derivatives of the step. The error is a
+    /// pivot that is too small.
+    pub(crate) fn differentiate_in_space(
         &mut self,
         at: Linearized<'_>,
         own: Own<'_>,
-        rows: Rows<'_>,
-    ) -> Result<bool, SmallestPivot> {
-        let Some(in_space) = &mut self.in_space else { return Ok(false) };
+        derivatives: &mut Derivatives,
+    ) -> Result<(), SmallestPivot> {
         let Linearized { model, mechanics, time_step_s, singular_below, .. } = at;
         let (diagonal, balls) = (&self.diagonal[..], &self.balls[..]);
         let added = Added { diagonal, balls, fields: self.fields.as_deref() };
         self.factored.valid = Factors::Stale;
         let step = (&model.conditioning.inertia[..], time_step_s);
-        let pivot = in_space.linearize((&mechanics.curvature, added), own, step, rows);
-        self.judge(pivot, singular_below).map(|()| true)
+        let pivot = derivatives.factor((&mechanics.curvature, added), own, step);
+        self.judge(pivot, singular_below)
     }
 
     /// Factors `K`, which is filled, by the tree LU. The error is a pivot that is too small.

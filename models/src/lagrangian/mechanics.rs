@@ -95,6 +95,20 @@ impl<S: Planar> Mechanics<S> {
         }
     }
 
+    /// Prepares second derivatives in space, where those of the scene are in a plane. `l_q` and `l_v` are room.
+    pub(crate) fn differentiate_in_space(
+        &mut self,
+        model: &Model,
+        [q, velocity]: [&[S]; 2],
+        orientations: &[Mat3<S>],
+        [l_q, l_v]: [&mut [S]; 2],
+    ) {
+        let (tree, gravity) = (&model.dynamics, model.gravity);
+        self.poses.evaluate(tree, q, orientations);
+        self.momenta.gradient(tree, &self.poses, velocity, gravity, l_q, l_v);
+        self.curvature.evaluate(tree, &self.poses, &self.momenta);
+    }
+
     /// Writes the Jacobian of the residual by the increment at the last gradient, without springs and forces,
     /// entry by entry.
     pub(crate) fn fill_newton_matrix(&mut self, model: &Model, step: f64, matrix: &mut TreeLu<S>) {

@@ -11,7 +11,8 @@
 
 use plantd_math::rows::{Term, add_rows, padded};
 
-use crate::linearization::linearize::{InputImpulse, Kind, Linearization, Part};
+use crate::linearization::ends::InputImpulse;
+use crate::linearization::linearize::{Kind, Linearization, Part};
 use crate::model::mechanism::Model;
 
 /// Numbers that the steps of a period may take: 1 GiB.
@@ -95,7 +96,7 @@ impl Chain {
             add_rows(target, tangent, stride, terms);
             let target = &mut target[inputs..][..ni];
             if matches!(step.kind, Kind::Step) {
-                for impulse in &step.inputs {
+                for impulse in &step.ends.inputs {
                     target[impulse.input] += impulse.residual * row[n + impulse.coordinate];
                 }
             } else {
@@ -113,11 +114,11 @@ impl Chain {
             follow(&mut next[(n + i) * stride..][..stride], &step.momentum, i, nd + nc);
         }
         if matches!(step.kind, Kind::Step) {
-            for &InputImpulse { input, coordinate, residual, momentum } in &step.inputs {
+            for &InputImpulse { input, coordinate, residual, momentum } in &step.ends.inputs {
                 next[(n + coordinate) * stride + inputs + input] += momentum - residual;
             }
         }
-        for t in &step.turnings {
+        for t in &step.ends.turnings {
             for column in 0..stride {
                 let at = |i: usize| (t.coordinate + i) * stride + column;
                 let [turn, start] = [&*next, &*tangent].map(|m| [0, 1, 2].map(|i| m[at(i)]));
@@ -139,8 +140,8 @@ impl Chain {
     pub(crate) fn finish(&self, h: f64, out: &mut Linearization) {
         let (theta, stride) = (out.parameters(), self.stride);
         let (nd, ni, n, inputs) = (theta.nd, theta.ni, theta.n(), theta.inputs());
-        out.time_step_s = h;
-        out.turnings.clear();
+        out.ends.time_step_s = h;
+        out.ends.turnings.clear();
         out.driven.clear();
         let row = |row: usize| &self.tangent[row * stride..][..stride];
         let increments = (0..nd).map(row);

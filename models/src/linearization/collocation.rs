@@ -115,7 +115,7 @@ impl Collocation {
         let turned = system.slopes.as_deref();
         for &c in &model.orientations {
             let turn = three(&workspace.step.increment, c);
-            out.turnings.push(Turning::new(model, c, turn, h));
+            out.ends.turnings.push(Turning::new(model, c, turn, h));
         }
         let [mut increment, mut moved] = [0; 2].map(|_| vec![0.0; stride]);
         for a in 0..nd {

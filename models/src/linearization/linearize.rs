@@ -38,18 +38,9 @@ use crate::integrator::settings::Settings;
 use crate::integrator::workspace::{StepContext, Workspace};
 use crate::kkt::schur::room_for_schur;
 use crate::kkt::system::Factors;
-use crate::lagrangian::turning::Turning;
+use crate::linearization::ends::{Ends, InputImpulse};
 use crate::linearization::matrices::Layout;
 use crate::model::mechanism::Model;
-
-/// What a unit input gives to the residual and to `p[k+1]` of a dynamic coordinate.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct InputImpulse {
-    pub(crate) input: usize,
-    pub(crate) coordinate: usize,
-    pub(crate) residual: f64,
-    pub(crate) momentum: f64,
-}
 
 /// What a row holds the derivatives of.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -106,12 +97,8 @@ pub struct Linearization {
     stages: Option<Box<StageTangents>>,
     pub(crate) nd: usize,
     pub(crate) nk: usize,
-    pub(crate) time_step_s: f64,
     pub(crate) ni: usize,
-    pub(crate) inputs: Vec<InputImpulse>,
-    /// Prescribed coordinates that signals drive, as columns of `B`.
-    pub(crate) replaced: Vec<usize>,
-    pub(crate) at_start: f64,
+    pub(crate) ends: Ends,
     /// Length of a row: the columns of the parameters `(q, p, k)`, padded.
     pub(crate) stride: usize,
     /// `x'`, row-major, nd rows.
@@ -120,8 +107,6 @@ pub struct Linearization {
     pub(crate) momentum: AlignedRows,
     /// `λ'`, row-major, nc rows.
     pub(crate) multipliers: AlignedRows,
-    /// How ball joints turn in the step.
-    pub(crate) turnings: Vec<Turning>,
     pub(crate) solved: SolvedStep,
 }
 
@@ -210,24 +195,12 @@ impl Linearization {
             stages: None,
             nd: d.dynamic,
             nk: d.prescribed,
-            time_step_s: model.scene().time_step_s,
             ni: d.inputs,
-            inputs: model
-                .input_pattern()
-                .map(|(coordinate, input)| InputImpulse {
-                    input,
-                    coordinate,
-                    residual: 0.0,
-                    momentum: 0.0,
-                })
-                .collect(),
-            replaced: model.replaced_inputs().collect(),
-            at_start: 0.5,
+            ends: Ends::new(model),
             stride,
             increment: AlignedRows::zeros(d.dynamic * stride),
             momentum: AlignedRows::zeros(d.dynamic * stride),
             multipliers: AlignedRows::zeros(d.constraints * stride),
-            turnings: Vec::with_capacity(model.orientations.len()),
             solved: SolvedStep::new(model),
         }
     }
@@ -240,7 +213,7 @@ impl Linearization {
                 && self.nk == d.prescribed
                 && self.constraints() == d.constraints
                 && self.ni == d.inputs
-                && self.inputs.len() == model.input_pattern().count(),
+                && self.ends.inputs.len() == model.input_pattern().count(),
             "the linearization belongs to another model"
         );
     }
@@ -282,8 +255,8 @@ impl Linearization {
     /// Begins a linearization of collocation over a step of length `h`.
     pub(crate) fn begin_collocation(&mut self, h: f64) {
         self.kind = Kind::Collocation;
-        self.time_step_s = h;
-        self.turnings.clear();
+        self.ends.time_step_s = h;
+        self.ends.turnings.clear();
         self.driven.resize((2 * self.nd + self.constraints()) * self.ni, 0.0);
     }
 
@@ -349,7 +322,7 @@ impl Linearization {
             self.write_by_input(Output::Multiplier(c), &mut row);
             target.iter_mut().zip(&row).for_each(|(to, from)| *to = *from);
         }
-        for &column in &self.replaced {
+        for &column in &self.ends.replaced {
             by_u.column_mut(column).fill(0.0);
         }
         by_u
@@ -371,7 +344,7 @@ impl Linearization {
     /// `(1 − a) h ∂f/∂u`, nd by ni each.
     pub fn input_impulses(&self) -> [DMatrix<f64>; 2] {
         let [mut at_start, mut at_end] = [0; 2].map(|_| DMatrix::zeros(self.nd, self.ni));
-        for &InputImpulse { input, coordinate, residual, momentum } in &self.inputs {
+        for &InputImpulse { input, coordinate, residual, momentum } in &self.ends.inputs {
             at_start[(coordinate, input)] += residual;
             at_end[(coordinate, input)] += momentum - residual;
         }
@@ -423,7 +396,7 @@ impl Linearization {
 
     /// What unit inputs give to a step of the midpoint rule.
     fn impulses(&self) -> &[InputImpulse] {
-        if self.kind == Kind::Step { &self.inputs } else { &[] }
+        if self.kind == Kind::Step { &self.ends.inputs } else { &[] }
     }
 
     /// A row of derivatives by the inputs of collocation and periods.

@@ -13,7 +13,7 @@ impl Linearization {
         let theta = self.parameters();
         let (nd, nk, ni) = (theta.nd, theta.nk, theta.ni);
         let (n, next, inputs) = (theta.n(), theta.inputs(), ni + nk);
-        if !self.turnings.is_empty() {
+        if !self.ends.turnings.is_empty() {
             let (mut a, mut b) = (DMatrix::zeros(2 * n, 2 * n), DMatrix::zeros(2 * n, inputs));
             self.a_into(a.as_mut_slice(), Layout::Columns);
             self.b_into(b.as_mut_slice(), Layout::Columns);
@@ -30,15 +30,15 @@ impl Linearization {
                 if part == 0 {
                     target[inputs + i] += 1.0;
                 }
-                self.replaced.iter().for_each(|column| target[*column] = 0.0);
+                self.ends.replaced.iter().for_each(|column| target[*column] = 0.0);
             }
         }
-        for (first, entry) in [(nd, 1.0), (n + nd, 1.0 / self.time_step_s)] {
-            let driven = (0..nk).filter(|k| !self.replaced.contains(&(ni + k)));
+        for (first, entry) in [(nd, 1.0), (n + nd, 1.0 / self.ends.time_step_s)] {
+            let driven = (0..nk).filter(|k| !self.ends.replaced.contains(&(ni + k)));
             driven.for_each(|k| map.push(first + k, ni + k, entry));
         }
         for k in 0..nk {
-            map.push(n + nd + k, inputs + nd + k, -1.0 / self.time_step_s);
+            map.push(n + nd + k, inputs + nd + k, -1.0 / self.ends.time_step_s);
         }
     }
 }

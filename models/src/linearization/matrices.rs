@@ -7,7 +7,8 @@ use plantd_math::rows::{Block, LANES};
 use plantd_math::simd::wide;
 use plantd_math::spatial::{Mat3, Vec3};
 
-use crate::linearization::linearize::{InputImpulse, Kind, Linearization};
+use crate::linearization::ends::InputImpulse;
+use crate::linearization::linearize::{Kind, Linearization};
 
 /// How the numbers of a matrix follow each other in memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -218,7 +219,7 @@ impl Linearization {
         if nk > 0 {
             a.clear();
         }
-        let turned = || self.turnings.iter().filter(|t| t.coordinate < nd);
+        let turned = || self.ends.turnings.iter().filter(|t| t.coordinate < nd);
         let mut next = 0;
         for t in turned() {
             let (first, i) = (next, t.coordinate);
@@ -238,11 +239,11 @@ impl Linearization {
         }
         (0..nd).for_each(|i| *a.at(i, i) += 1.0);
         for k in 0..nk {
-            *a.at(n + nd + k, nd + k) = -1.0 / self.time_step_s;
+            *a.at(n + nd + k, nd + k) = -1.0 / self.ends.time_step_s;
         }
-        for t in self.turnings.iter().filter(|t| t.coordinate >= nd) {
+        for t in self.ends.turnings.iter().filter(|t| t.coordinate >= nd) {
             let i = t.coordinate;
-            a.put_block(&t.momentum.transpose().scaled(-1.0 / self.time_step_s), [n + i, i]);
+            a.put_block(&t.momentum.transpose().scaled(-1.0 / self.ends.time_step_s), [n + i, i]);
         }
     }
 
@@ -257,7 +258,7 @@ impl Linearization {
         let mut b = Target::new(out, layout, [2 * n, ni + nk]);
         b.clear();
         if self.kind == Kind::Step {
-            let mut rest = &self.inputs[..];
+            let mut rest = &self.ends.inputs[..];
             while let Some(impulse) = rest.first() {
                 let (column, input) = (n + impulse.coordinate, impulse.input);
                 let of_ball = of_ball(rest);
@@ -285,17 +286,17 @@ impl Linearization {
         }
         for k in 0..nk {
             *b.at(nd + k, ni + k) = 1.0;
-            *b.at(n + nd + k, ni + k) = 1.0 / self.time_step_s;
+            *b.at(n + nd + k, ni + k) = 1.0 / self.ends.time_step_s;
         }
-        for t in &self.turnings {
+        for t in &self.ends.turnings {
             let i = t.coordinate;
             if i < nd {
                 b.turn_rows(&t.to_end, i);
             } else {
-                b.put_block(&t.momentum.scaled(1.0 / self.time_step_s), [n + i, ni + i - nd]);
+                b.put_block(&t.momentum.scaled(1.0 / self.ends.time_step_s), [n + i, ni + i - nd]);
             }
         }
-        for &column in &self.replaced {
+        for &column in &self.ends.replaced {
             (0..2 * n).for_each(|row| *b.at(row, column) = 0.0);
         }
     }

@@ -3,11 +3,13 @@
 //! Everything is differentiated by one list of parameters, `θ = (q, p, u, k)` ([`parameters`](crate::integrator::parameters)). Read
 //! [`linearize`] first: it has the equations of a step; [`mod@step`] fills their right-hand sides, with ball
 //! joints [`turned`], [`chain`] goes on over the steps of a period, [`collocation`] over stages, [`map`] hands
-//! it to linear-quadratic problems, [`matrices`] to whoever wants `A` and `B`, and [`second_order`]
-//! differentiates once more.
+//! it to linear-quadratic problems, [`matrices`] to whoever wants `A` and `B`, [`derivative`] to whoever wants no
+//! more than products with them, and [`second_order`] differentiates once more.
 
 pub(crate) mod chain;
 pub(crate) mod collocation;
+pub(crate) mod derivative;
+pub(crate) mod ends;
 pub(crate) mod linearize;
 pub(crate) mod map;
 pub(crate) mod matrices;

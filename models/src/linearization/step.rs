@@ -10,9 +10,12 @@ use crate::integrator::settings::{ForceSplit, Settings};
 use crate::integrator::workspace::{StepContext, Tangents, Workspace};
 use crate::kkt::loops;
 use crate::kkt::planar::Diagonals;
-use crate::kkt::space::columns::{Own, Rows};
+use crate::kkt::space::columns::Rows;
+use crate::kkt::space::derivatives::Derivatives;
+use crate::kkt::space::margins::Own;
 use crate::kkt::system::Recursion;
 use crate::lagrangian::planar::PlanarTree;
+use crate::linearization::ends::Ends;
 use crate::linearization::linearize::{Kind, Linearization};
 use crate::model::mechanism::Model;
 
@@ -25,8 +28,8 @@ impl Workspace {
     ) -> Result<(), StepError> {
         let d = at.model.dimensions;
         out.kind = Kind::Step;
-        out.time_step_s = at.settings.time_step_s;
-        out.at_start = at.settings.force_split.at_start();
+        out.ends.time_step_s = at.settings.time_step_s;
+        out.ends.at_start = at.settings.force_split.at_start();
         if !self.step.is_evaluated {
             self.evaluate(at.model, at.settings, at.state);
         }
@@ -79,7 +82,7 @@ impl Workspace {
         if !self.factor_recursion(model, at.settings)? {
             return Ok(false);
         }
-        fill_inputs(at, out);
+        fill_inputs(at, &mut out.ends);
         self.fill_diagonals(model, at.settings);
         let tree = self.mid.mechanics.planar.as_deref().and_then(PlanarTree::many);
         let (Some(tree), Some(joints), Recursion::Planar(recursion)) =
@@ -99,35 +102,48 @@ impl Workspace {
         at: StepContext<'_>,
         out: &mut Linearization,
     ) -> Result<bool, StepError> {
-        let StepContext { model, settings, .. } = at;
-        // Generators of forces at poses are those of equal halves.
-        let is_split = settings.force_split == ForceSplit::Paper && model.forces.is_some();
-        if self.kkt.in_space.is_none() || (self.kkt.fields.is_some() && is_split) {
+        if !takes_split(at.model, at.settings) {
             return Ok(false);
         }
+        let Some(mut in_space) = self.kkt.in_space.take() else { return Ok(false) };
+        self.mid.mechanics.differentiate(at.model);
+        let result = self.differentiate_in_space(at, &mut out.ends, &mut in_space);
+        let (increment, momentum, stride) = (&mut out.increment, &mut out.momentum, out.stride);
+        in_space.write(Rows { increment, momentum, stride });
+        self.kkt.in_space = Some(in_space);
+        result.map(|()| true)
+    }
+
+    /// Factors by generators at the last second derivatives in space, for derivatives of the step, and finds how
+    /// inputs act in it.
+    pub(crate) fn differentiate_in_space(
+        &mut self,
+        at: StepContext<'_>,
+        ends: &mut Ends,
+        derivatives: &mut Derivatives,
+    ) -> Result<(), StepError> {
+        let StepContext { model, settings, .. } = at;
         self.weigh_coordinates(model, settings);
-        self.mid.mechanics.differentiate(model);
         self.fill_diagonals(model, settings);
-        out.turnings.clear();
+        ends.turnings.clear();
         if model.orientations.is_empty() {
-            fill_inputs(at, out);
-            self.fill_inputs_of_forces(at, out);
+            fill_inputs(at, ends);
+            self.fill_inputs_of_forces(at, ends);
         } else {
-            self.find_turnings(at, out);
+            self.find_turnings(at, ends);
             let Self { mid, kkt, tangents, .. } = self;
             mid.for_each_own_torque(model, kkt.fields.as_deref(), |o, own| {
-                tangents.balls[o].add_torque(&out.turnings[o], own, out.time_step_s);
+                tangents.balls[o].add_torque(&ends.turnings[o], own, ends.time_step_s);
             });
-            self.fill_turned_inputs(model, out);
+            self.fill_turned_inputs(model, ends);
         }
         let Self { mid, kkt, constraints, tangents, .. } = self;
         let constraints = [&constraints.start, &constraints.end];
         let at = linearized(model, settings, &mut mid.mechanics, constraints);
         let Tangents { diagonals, balls, .. } = &*tangents;
-        let own = Own { diagonals, turnings: &out.turnings, balls };
-        let (increment, momentum, stride) = (&mut out.increment, &mut out.momentum, out.stride);
-        let rows = Rows { increment, momentum, stride };
-        kkt.linearize_in_space(at, own, rows).map_err(|pivot| model.singular_matrix(pivot))
+        let own = Own { diagonals, turnings: &ends.turnings, balls };
+        kkt.differentiate_in_space(at, own, derivatives)
+            .map_err(|pivot| model.singular_matrix(pivot))
     }
 
     /// What springs, dampers and forces of coordinates give to the derivatives.
@@ -181,7 +197,7 @@ impl Workspace {
             &self.step.multipliers,
             &mut self.tangents.constraint_hessian,
         );
-        fill_inputs(at, out);
+        fill_inputs(at, &mut out.ends);
         self.fill_diagonals(model, settings);
         let tree = self.mid.mechanics.planar.as_deref().and_then(PlanarTree::many);
         let (Some(tree), Some(start), Some(end), Recursion::Loops(fronts)) = (
@@ -241,14 +257,14 @@ impl Workspace {
             let (nd, nk, stride) = (out.nd, out.nk, out.stride);
             out.increment.fill(0.0);
             out.momentum.fill(0.0);
-            out.turnings.clear();
+            out.ends.turnings.clear();
             if !model.orientations.is_empty() {
                 self.fill_turned_right_hand_sides(at, out);
                 self.add_constraint_hessian(at, out);
                 add_momenta(out);
                 return;
             }
-            fill_inputs(at, out);
+            fill_inputs(at, &mut out.ends);
             self.tangents.end_slopes.fill(0.0);
             for pair in &model.pairs {
                 let (i, j) = (pair.row as usize, pair.column as usize);
@@ -360,7 +376,7 @@ impl Workspace {
     fn add_forces(&mut self, at: StepContext<'_>, out: &mut Linearization) {
         let Some(forces) = &at.model.forces else { return };
         let h = at.settings.time_step_s;
-        let (nd, nk, stride, a) = (out.nd, out.nk, out.stride, out.at_start);
+        let (nd, nk, stride, a) = (out.nd, out.nk, out.stride, out.ends.at_start);
         let Tangents { end_slopes: slopes, .. } = &mut self.tangents;
         let instant = self.mid.instant(at.model);
         forces.for_each_derivative(&instant, |row, column, by_q, by_v| {
@@ -376,14 +392,15 @@ impl Workspace {
                 }
             }
         });
-        self.fill_inputs_of_forces(at, out);
+        self.fill_inputs_of_forces(at, &mut out.ends);
     }
 
     /// What unit inputs give by forces.
-    fn fill_inputs_of_forces(&self, at: StepContext<'_>, out: &mut Linearization) {
+    fn fill_inputs_of_forces(&self, at: StepContext<'_>, ends: &mut Ends) {
         let Some(forces) = &at.model.forces else { return };
-        let (h, nd, a) = (at.settings.time_step_s, out.nd, out.at_start);
-        let mut places = out.inputs[at.model.coordinate_inputs.len()..].iter_mut();
+        let nd = at.model.dimensions.dynamic;
+        let (h, a) = (at.settings.time_step_s, ends.at_start);
+        let mut places = ends.inputs[at.model.coordinate_inputs.len()..].iter_mut();
         forces.for_each_input_derivative(&self.mid.instant(at.model), |row, _, by_u| {
             let place = if row < nd { places.next() } else { None };
             if let Some(place) = place {
@@ -425,7 +442,7 @@ impl Workspace {
         for (target, jacobian) in rows.zip(self.constraints.end.jacobian.chunks_exact(n.max(1))) {
             target.fill(0.0);
             target[..nd].copy_from_slice(&jacobian[..nd]);
-            for turning in out.turnings.iter().filter(|turning| turning.coordinate < nd) {
+            for turning in out.ends.turnings.iter().filter(|turning| turning.coordinate < nd) {
                 // From the columns of `ξ`, by dexp₋ξ, to those of the start: exp(−ξ) = dexp₋ξ N⁺.
                 let i = turning.coordinate;
                 let carried = turning.momentum.apply(three(target, i));
@@ -460,11 +477,17 @@ impl Workspace {
     }
 }
 
+/// Whether generators have what forces at poses give to derivatives: they are those of equal halves.
+pub(crate) fn takes_split(model: &Model, settings: &Settings) -> bool {
+    let is_split = settings.force_split == ForceSplit::Paper && model.forces.is_some();
+    !(is_split && model.has_fields())
+}
+
 /// Impulses of inputs of coordinates.
-fn fill_inputs(at: StepContext<'_>, out: &mut Linearization) {
-    for (place, input) in out.inputs.iter_mut().zip(&at.model.coordinate_inputs) {
+fn fill_inputs(at: StepContext<'_>, ends: &mut Ends) {
+    for (place, input) in ends.inputs.iter_mut().zip(&at.model.coordinate_inputs) {
         place.momentum = at.settings.time_step_s * input.gain;
-        place.residual = out.at_start * place.momentum;
+        place.residual = ends.at_start * place.momentum;
     }
 }
 

@@ -20,11 +20,12 @@ use plantd_math::spatial::{Mat3, three};
 
 use crate::integrator::balls::BallJoints;
 use crate::integrator::workspace::{StepContext, Tangents, Workspace};
-use crate::kkt::space::columns::OfBall;
+use crate::kkt::space::margins::OfBall;
 use crate::lagrangian::curvature::Within;
 use crate::lagrangian::fields::OwnTorque;
 use crate::lagrangian::generators::{Flanks, Parts};
 use crate::lagrangian::turning::Turning;
+use crate::linearization::ends::Ends;
 use crate::linearization::linearize::Linearization;
 use crate::model::mechanism::{Model, Pair};
 use crate::model::tree::JointKind;
@@ -258,14 +259,14 @@ impl Workspace {
         out: &mut Linearization,
     ) {
         let (model, h) = (at.model, at.settings.time_step_s);
-        self.find_turnings(at, out);
+        self.find_turnings(at, &mut out.ends);
         let Self { mid, kkt, balls, tangents, .. } = self;
         let balls = &*balls;
-        tangents.find_flanks(model, &mid.mechanics.curvature, (&out.turnings, &kkt.balls), h);
-        let split = h * out.at_start;
+        tangents.find_flanks(model, &mid.mechanics.curvature, (&out.ends.turnings, &kkt.balls), h);
+        let split = h * out.ends.at_start;
         let mut sink = Sink {
             balls,
-            turnings: &out.turnings,
+            turnings: &out.ends.turnings,
             tangents,
             increment: &mut out.increment,
             momentum: &mut out.momentum,
@@ -314,24 +315,24 @@ impl Workspace {
                 }
             });
         }
-        self.fill_turned_inputs(model, out);
+        self.fill_turned_inputs(model, &mut out.ends);
     }
 
     /// How ball joints turn, and what they have of themselves, at the second derivatives of the last Newton
     /// matrix.
-    pub(crate) fn find_turnings(&mut self, at: StepContext<'_>, out: &mut Linearization) {
-        let (model, h, nd) = (at.model, at.settings.time_step_s, out.nd);
-        let skew = (2.0 * out.at_start - 1.0) * h;
+    pub(crate) fn find_turnings(&mut self, at: StepContext<'_>, ends: &mut Ends) {
+        let (model, h, nd) = (at.model, at.settings.time_step_s, at.model.dimensions.dynamic);
+        let skew = (2.0 * ends.at_start - 1.0) * h;
         let Self { mid, balls, tangents, .. } = self;
         let turns = model.orientations.iter().zip(&balls.turns);
-        out.turnings.clear();
-        out.turnings.extend(turns.map(|(&i, turn)| Turning::new(model, i, turn.xi, h)));
+        ends.turnings.clear();
+        ends.turnings.extend(turns.map(|(&i, turn)| Turning::new(model, i, turn.xi, h)));
         for (first, joint) in model.dynamics.joints.iter().enumerate() {
             let i = joint.coordinate;
             if joint.kind != JointKind::Ball(0) || i >= nd {
                 continue;
             }
-            let turning = &out.turnings[joint.orientation];
+            let turning = &ends.turnings[joint.orientation];
             let forces = turning.turn.changes().of_torque(three(&mid.force, i));
             let turned = rotation::crossed(-three(&mid.l_v, i)).plus(&forces.scaled(skew));
             let within = mid.mechanics.curvature.within_ball(first);
@@ -343,16 +344,16 @@ impl Workspace {
         }
         for a in &model.armature {
             if let Some((o, axis)) = balls.of(a.row) {
-                tangents.balls[o].add(&out.turnings[o], axis, [0.0, a.inertia], [h, skew]);
+                tangents.balls[o].add(&ends.turnings[o], axis, [0.0, a.inertia], [h, skew]);
             }
         }
     }
 
     /// What unit inputs give, in the places of [`Model::input_pattern`].
-    pub(crate) fn fill_turned_inputs(&mut self, model: &Model, out: &mut Linearization) {
-        let (h, nd) = (out.time_step_s, out.nd);
-        let (split, skew) = (h * out.at_start, (2.0 * out.at_start - 1.0) * h);
-        let Linearization { inputs, turnings, .. } = out;
+    pub(crate) fn fill_turned_inputs(&mut self, model: &Model, ends: &mut Ends) {
+        let (h, nd) = (ends.time_step_s, model.dimensions.dynamic);
+        let (split, skew) = (h * ends.at_start, (2.0 * ends.at_start - 1.0) * h);
+        let Ends { inputs, turnings, .. } = ends;
         let mut places = inputs.iter_mut();
         let mut put = |i: usize, by_u: f64| {
             let mut set = |residual: f64, momentum: f64| {
@@ -547,7 +548,7 @@ coefficient = 0.03
                 assert_close("momentum by next position", found, &by_next[nd..]);
             }
             let (mut residual, mut change) = (vec![0.0; nd * ni], vec![0.0; nd * ni]);
-            for place in &out.inputs {
+            for place in &out.ends.inputs {
                 let entry = place.coordinate * ni + place.input;
                 residual[entry] += place.residual;
                 change[entry] += place.momentum;

@@ -647,14 +647,19 @@ pub struct OperatingPoint {
 }
 
 impl Model {
-    /// Whether vectors of the joints generate the whole Newton matrix in space: without constraints, and what acts
-    /// between two bodies or couples coordinates.
+    /// Whether steps go by vectors of the joints in space: where they generate the whole Newton matrix, and it is no
+    /// tree in a plane, which is solved there.
     pub(crate) fn is_generated_in_space(&self) -> bool {
+        self.planar.is_none() && self.is_generated()
+    }
+
+    /// Whether vectors of the joints generate the whole Newton matrix: without constraints, and what acts between two
+    /// bodies or couples coordinates.
+    pub(crate) fn is_generated(&self) -> bool {
         let d = self.dimensions;
         let are_generated =
             |forces: &Forces| forces.are_fields() && !forces.act_on_balls(&self.orientations);
-        self.planar.is_none()
-            && d.constraints == 0
+        d.constraints == 0
             && self.forces.as_ref().is_none_or(are_generated)
             && self.potentials.springs.iter().all(Spring::is_generated)
             && self.armature.iter().all(|armature| armature.row == armature.column)

@@ -11,6 +11,7 @@
 //! - its derivatives: [`second_order`], [`known`] (of a step whose solution is known).
 
 pub(crate) mod choice;
+pub(crate) mod derivative;
 pub(crate) mod diagnose;
 pub(crate) mod facade;
 pub(crate) mod fleet;

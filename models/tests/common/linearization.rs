@@ -1,6 +1,7 @@
 //! The linearization of a step against sixth-order central differences of the step itself.
 
-use plantd_models::{Initial, Linearization, Plant, Scene, Settings, State};
+use nalgebra::DVector;
+use plantd_models::{Initial, Linearization, Plant, Scene, Settings, State, StepDerivative};
 
 use super::{SPLITS, STENCIL, plant, wave, waving_input};
 
@@ -54,10 +55,14 @@ impl Check {
         let mut out = Linearization::new(&plant.model().clone());
         plant.linearize(&u, &mut out).unwrap();
         assert_eq!(plant.state(), x, "linearize must stay");
+        let mut products = StepDerivative::new(&plant.model().clone());
+        plant.differentiate(&u, &mut products).unwrap();
+        assert_eq!(plant.state(), x, "differentiate must stay");
         plant.step(&u).unwrap();
         let end = plant.q().to_vec();
         let Settings { order, substeps, force_split, .. } = plant.settings();
         let name = format!("{}, {force_split:?}, order {order} x {substeps}", scene.name);
+        compare_products(&name, &out, &mut products);
         Self { plant, x, u, end, out, name, reach }
     }
 
@@ -178,6 +183,26 @@ impl Check {
             self.compare(&format!("direction {direction}"), found, predicted, 10.0 * TOLERANCE);
         }
     }
+}
+
+/// Products with the matrices and with their transposes, without them.
+fn compare_products(name: &str, out: &Linearization, products: &mut StepDerivative) {
+    let (a, b) = (out.a(), out.b());
+    let wave = |count, phase: f64| DVector::from_fn(count, |i, _| (1.3 * i as f64 + phase).sin());
+    let (x, u, z) = (wave(a.ncols(), 0.2), wave(b.ncols(), 0.7), wave(a.nrows(), 1.1));
+    let close = |what: &str, found: &[f64], expected: DVector<f64>, sizes: DVector<f64>| {
+        for (i, (found, expected)) in found.iter().zip(&expected).enumerate() {
+            let error = (found - expected).abs();
+            assert!(error <= 1e-11 * sizes.amax(), "{name}: {what}[{i}] {found}, {expected}");
+        }
+    };
+    let mut next = vec![f64::NAN; a.nrows()];
+    products.push_forward(x.as_slice(), u.as_slice(), &mut next);
+    close("A x + B u", &next, &a * &x + &b * &u, a.abs() * x.abs() + b.abs() * u.abs());
+    let (mut by_x, mut by_u) = (vec![f64::NAN; a.ncols()], vec![f64::NAN; b.ncols()]);
+    products.pull_back(z.as_slice(), &mut by_x, &mut by_u);
+    close("Aᵀ z", &by_x, a.tr_mul(&z), a.abs().tr_mul(&z.abs()));
+    close("Bᵀ z", &by_u, b.tr_mul(&z), b.abs().tr_mul(&z.abs()));
 }
 
 /// Checks every column, for both ways to split forces.

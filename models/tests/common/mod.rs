@@ -274,7 +274,6 @@ pub(crate) fn forced_tree(seed: u64) -> Scene {
     scene
 }
 
-/// A body that floats freely, with two arms; no gravity.
 /// A rope of rods hinged about x and y by turns, with ball joints on the way and a slide that is moved, and springs of
 /// both between bodies and the world; `more` goes on it. It goes by generators.
 pub(crate) fn pulled_rope(more: &str) -> Scene {
@@ -362,6 +361,7 @@ name = "f14_rz"
 kind = "prescribed"
 "#;
 
+/// A body that floats freely, with two arms; no gravity.
 pub(crate) fn floating() -> Scene {
     Scene::from_toml(FLOATING).unwrap()
 }

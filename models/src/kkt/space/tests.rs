@@ -11,7 +11,7 @@ use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
 use crate::integrator::workspace::Workspace;
 use crate::kkt::space::Spatial;
-use crate::kkt::space::columns::InSpace;
+use crate::kkt::space::derivatives::Derivatives;
 use crate::kkt::system::{Linearized, Recursion};
 use crate::lagrangian::fields::Fields;
 use crate::lagrangian::generators::MatrixKind;
@@ -99,7 +99,7 @@ fn rope(n: usize, more: &str) -> String {
 fn generate(workspace: &mut Workspace, model: &Model) {
     assert!(model.is_generated_in_space());
     workspace.kkt.factored.recursion = Recursion::Spatial(Box::new(Spatial::new(model)));
-    workspace.kkt.in_space = Some(Box::new(InSpace::new(model)));
+    workspace.kkt.in_space = Some(Derivatives::new(model));
     workspace.kkt.fields = model.has_fields().then(|| Box::new(Fields::new(model)));
 }
 

@@ -15,7 +15,7 @@ use plantd_math::eights::Eight;
 use plantd_math::spatial::Mat3;
 
 use crate::kkt::space::Added;
-use crate::kkt::space::lines::InLine;
+use crate::kkt::space::lines::{InLine, Line};
 use crate::lagrangian::curvature::Curvature;
 use crate::lagrangian::fields::{Fields, Given};
 use crate::lagrangian::generators::{Flanks, Generators, Parts, Step, columns, of_ball, rows};
@@ -39,6 +39,17 @@ pub(crate) struct Margin<V> {
     pub(crate) above: V,
     /// `below + A above`.
     pub(crate) below: V,
+}
+
+impl<E: Eight, const B: usize> Margin<InLine<E, B>> {
+    /// To memory.
+    #[inline(always)]
+    pub(crate) fn put(self, to: &mut Margin<Line<B>>) {
+        self.carry.put(&mut to.carry);
+        self.push.put(&mut to.push);
+        self.above.put(&mut to.above);
+        self.below.put(&mut to.below);
+    }
 }
 
 /// `¼h pull`, `¼h turn`, `½ drag` and `½ back`.

@@ -1,0 +1,150 @@
+//! The derivatives of a step of a tree in space: factored in O(n), then all of them in O(n²), or products in O(n).
+
+use plantd_math::eights::{Eight, InEights, in_eights};
+use plantd_math::tree_lu::SmallestPivot;
+
+use crate::kkt::space::columns::{AllColumns, Columns, Rows};
+use crate::kkt::space::margins::{Keep, Margins, Own};
+use crate::kkt::space::products::{PullBack, PushForward};
+use crate::kkt::space::vectors::Vectors;
+use crate::kkt::space::{Added, Factor, SpatialRecursion};
+use crate::lagrangian::curvature::Curvature;
+use crate::lagrangian::generators::{MatrixKind, Step};
+use crate::model::mechanism::Model;
+
+/// The elimination of a step, with what derivatives need of it.
+#[derive(Clone, Debug)]
+pub(crate) struct Eliminated<const B: usize> {
+    recursion: SpatialRecursion<B>,
+    margins: Margins<B>,
+    columns: Columns<B>,
+}
+
+impl<const B: usize> Eliminated<B> {
+    fn new(model: &Model) -> Self {
+        let recursion = SpatialRecursion::new(model);
+        Self { margins: Margins::new(&recursion), recursion, columns: Columns::default() }
+    }
+
+    /// Factors as [`SpatialRecursion::factor`] does.
+    #[inline(never)]
+    fn factor(&mut self, vectors: Vectors<'_>, own: Own<'_>, inertia: &[f64]) -> SmallestPivot {
+        let Self { recursion, margins: kept, .. } = self;
+        let factor = Factor { recursion, vectors, inertia };
+        in_eights(FactorAndKeep { factor, keep: Keep { kept, vectors, own } })
+    }
+
+    #[inline(never)]
+    fn write(&mut self, rows: Rows<'_>) {
+        let Self { recursion, margins, columns } = self;
+        in_eights(AllColumns { recursion, margins, columns, rows });
+    }
+
+    #[inline(never)]
+    fn push_forward(&mut self, by: &[f64], x: &mut [f64], momentum: &mut [f64]) {
+        let Self { recursion, margins, .. } = self;
+        in_eights(PushForward { recursion, margins, by, x, momentum });
+    }
+
+    #[inline(never)]
+    fn pull_back(&mut self, x: &mut [f64], momentum: &[f64], by: &mut [f64]) {
+        let Self { recursion, margins, .. } = self;
+        in_eights(PullBack { recursion, margins, x, momentum, by });
+    }
+
+    /// Whether a linearization takes less time by columns than with so many entries in each triangle of the Newton
+    /// matrix. What forks cost is in the number of limbs. Of the time entry by entry it took:
+    ///
+    /// ```text
+    /// entries over joints and limbs      tree-7 1.2   tree-15 1.6   tree-30 2.1   tree-63 2.5   tree-127 3.1
+    /// time                                      1.5           1.5          1.4           1.5            1.45
+    /// entries over joints and limbs      arm of 7 hinges 3.5   balls-3 3   walker-2 4.6   walker-4 5.1   chain-8 4
+    /// time                                             0.9           0.8            0.7            0.7         0.85
+    /// and with vectors of two blocks     chain-8 4   quadruped 4.3   rope of 16 8   rope of 32 16
+    /// time                                    1.05             1.2           0.75            0.43
+    /// ```
+    fn is_faster_by_columns(&self, entries: usize) -> bool {
+        let SpatialRecursion { axes, limbs, .. } = &self.recursion;
+        let least = if B == 1 { 31 } else { 48 };
+        10 * entries > least * (axes.len() + limbs.len())
+    }
+}
+
+/// An elimination that is watched.
+struct FactorAndKeep<'a, const B: usize> {
+    factor: Factor<'a, B>,
+    keep: Keep<'a, B>,
+}
+
+impl<const B: usize> InEights for FactorAndKeep<'_, B> {
+    type Output = SmallestPivot;
+
+    #[inline(always)]
+    fn run<E: Eight>(mut self) -> SmallestPivot {
+        self.factor.watched::<E>(&mut self.keep)
+    }
+}
+
+/// The derivatives of a step by generators in space, whatever steps are solved by. They are by the configuration
+/// at the start, and by the momentum of dynamic and the next position of prescribed coordinates: `2n` columns.
+#[derive(Clone, Debug)]
+pub(crate) enum Derivatives {
+    OfBodies(Box<Eliminated<1>>),
+    WithFields(Box<Eliminated<2>>),
+}
+
+impl Derivatives {
+    pub(crate) fn new(model: &Model) -> Self {
+        match model.has_fields() {
+            false => Self::OfBodies(Box::new(Eliminated::new(model))),
+            true => Self::WithFields(Box::new(Eliminated::new(model))),
+        }
+    }
+
+    /// Whether all of them take less time than with so many entries in each triangle of the Newton matrix.
+    pub(crate) fn is_faster(&self, entries: usize) -> bool {
+        match self {
+            Self::OfBodies(own) => own.is_faster_by_columns(entries),
+            Self::WithFields(own) => own.is_faster_by_columns(entries),
+        }
+    }
+
+    /// Factors at the second derivatives of the bodies.
+    pub(crate) fn factor(
+        &mut self,
+        (curvature, added): (&Curvature, Added<'_>),
+        own: Own<'_>,
+        (inertia, time_step_s): (&[f64], f64),
+    ) -> SmallestPivot {
+        let vectors =
+            Vectors { curvature, added, step: Step::new(time_step_s, MatrixKind::Newton) };
+        match self {
+            Self::OfBodies(all) => all.factor(vectors, own, inertia),
+            Self::WithFields(all) => all.factor(vectors, own, inertia),
+        }
+    }
+
+    /// Writes all of them into rows of whole blocks.
+    pub(crate) fn write(&mut self, rows: Rows<'_>) {
+        match self {
+            Self::OfBodies(all) => all.write(rows),
+            Self::WithFields(all) => all.write(rows),
+        }
+    }
+
+    /// The increments `x'` and momenta at the end that belong to changes `by` of the columns.
+    pub(crate) fn push_forward(&mut self, by: &[f64], x: &mut [f64], momentum: &mut [f64]) {
+        match self {
+            Self::OfBodies(all) => all.push_forward(by, x, momentum),
+            Self::WithFields(all) => all.push_forward(by, x, momentum),
+        }
+    }
+
+    /// The derivatives by the columns of `x · x' + momentum · p[k+1]'`; uses up `x`.
+    pub(crate) fn pull_back(&mut self, x: &mut [f64], momentum: &[f64], by: &mut [f64]) {
+        match self {
+            Self::OfBodies(all) => all.pull_back(x, momentum, by),
+            Self::WithFields(all) => all.pull_back(x, momentum, by),
+        }
+    }
+}

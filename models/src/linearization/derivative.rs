@@ -1,0 +1,358 @@
+//! The derivative of a step as a map: products with `A`, `B` and their transposes, without the matrices.
+
+use plantd_math::sparse_map::Map;
+use plantd_math::spatial::three;
+
+use crate::integrator::report::StepError;
+use crate::integrator::settings::Settings;
+use crate::integrator::workspace::{StepContext, Workspace};
+use crate::kkt::space::derivatives::Derivatives;
+use crate::lagrangian::fields::Fields;
+use crate::linearization::ends::Ends;
+use crate::linearization::linearize::Linearization;
+use crate::linearization::step::takes_split;
+use crate::model::mechanism::Model;
+
+/// The derivative of a control period as a map, `x[k+1]' = A x[k]' + B u[k]'`, and its transpose: for gradients along
+/// motions, and for whoever solves by iteration.
+///
+/// Of one step of the midpoint rule of a tree it takes O(n) to find and to apply, and O(n) of memory, where `A` and
+/// `B` take O(n²): without constraints, and without springs, dampers and forces that act between two bodies. Springs,
+/// drag and forces at points and frames that act from the world are taken with equal halves
+/// ([`ForceSplit::Symmetric`](crate::ForceSplit)) alone. All else is by the matrices, to the same numbers. The memory is made by the first
+/// [`Plant::differentiate`](crate::Plant::differentiate).
+///
+/// ```
+/// use std::sync::Arc;
+///
+/// use plantd_models::{Model, Plant, Settings, StepDerivative, builtin};
+///
+/// // How the last angle of a chain changes with the first torque of a motion.
+/// let model = Arc::new(Model::compile(&builtin::scene("chain-8").expect("a builtin scene"))?);
+/// let mut plant = Plant::new(model.clone(), Settings::new(&model))?;
+/// let (states, inputs) = (model.dimensions().state(), model.dimensions().input());
+/// let mut steps = Vec::new();
+/// for _ in 0..100 {
+///     let mut step = StepDerivative::new(&model);
+///     plant.step_and_differentiate(&vec![0.0; inputs], &mut step)?;
+///     steps.push(step);
+/// }
+/// let (mut gradient, mut by_x, mut by_u) =
+///     (vec![0.0; states], vec![0.0; states], vec![0.0; inputs]);
+/// gradient[7] = 1.0;
+/// for step in steps.iter_mut().rev() {
+///     step.pull_back(&gradient, &mut by_x, &mut by_u);
+///     std::mem::swap(&mut gradient, &mut by_x);
+/// }
+/// assert!(by_u.iter().any(|slope| *slope != 0.0));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+#[derive(Debug)]
+pub struct StepDerivative {
+    nd: usize,
+    nk: usize,
+    ni: usize,
+    ends: Ends,
+    means: Means,
+    generated: Option<Box<Generated>>,
+    formed: Option<Box<Formed>>,
+    /// Changes of `(q, p, k)`, of the increment, and of `p[k+1]`.
+    by: Vec<f64>,
+    x: Vec<f64>,
+    momentum: Vec<f64>,
+}
+
+/// What holds the last derivative.
+#[derive(Clone, Copy, Debug)]
+enum Means {
+    Nothing,
+    Generated,
+    Formed,
+}
+
+/// By generators.
+#[derive(Debug)]
+struct Generated {
+    derivatives: Derivatives,
+    /// What acts on bodies from the world, where steps have not that.
+    fields: Option<Box<Fields>>,
+}
+
+/// By matrices.
+#[derive(Debug)]
+struct Formed {
+    linearization: Linearization,
+    map: Map,
+    packed: Vec<f64>,
+}
+
+/// Whether the derivative of one step of the midpoint rule is by generators.
+pub(crate) fn is_generated(model: &Model, settings: &Settings) -> bool {
+    model.is_generated() && takes_split(model, settings)
+}
+
+impl StepDerivative {
+    /// Room for the derivative of a model's steps. Until a plant is differentiated, it is zero; and after that failed.
+    pub fn new(model: &Model) -> Self {
+        let d = model.dimensions();
+        Self {
+            nd: d.dynamic,
+            nk: d.prescribed,
+            ni: d.inputs,
+            ends: Ends::new(model),
+            means: Means::Nothing,
+            generated: None,
+            formed: None,
+            by: vec![0.0; 2 * d.coordinates()],
+            x: vec![0.0; d.dynamic],
+            momentum: vec![0.0; d.dynamic],
+        }
+    }
+
+    /// Forgets the last step. Panics if it was made for a model of other dimensions.
+    pub(crate) fn begin(&mut self, model: &Model) {
+        let d = model.dimensions;
+        assert!(
+            self.nd == d.dynamic
+                && self.nk == d.prescribed
+                && self.ni == d.inputs
+                && self.ends.inputs.len() == model.input_pattern().count(),
+            "the derivative belongs to another model"
+        );
+        self.means = Means::Nothing;
+    }
+
+    /// Differentiates by matrices, as `linearize` finds them.
+    pub(crate) fn form<T, E>(
+        &mut self,
+        model: &Model,
+        linearize: impl FnOnce(&mut Linearization) -> Result<T, E>,
+    ) -> Result<T, E> {
+        let formed = self.formed.get_or_insert_with(|| {
+            let linearization = Linearization::new(model);
+            Box::new(Formed { linearization, map: Map::default(), packed: Vec::new() })
+        });
+        let found = linearize(&mut formed.linearization)?;
+        formed.linearization.write_map(&mut formed.map);
+        self.means = Means::Formed;
+        Ok(found)
+    }
+
+    /// `A x + B u`, into `next`.
+    ///
+    /// # Panics
+    ///
+    /// If `x` and `next` do not have the `2 nd + 2 nk` entries of a state, or `u` not the `ni + nk` of an input.
+    pub fn push_forward(&mut self, x: &[f64], u: &[f64], next: &mut [f64]) {
+        let Self { nd, nk, ni, ends, means, generated, formed, by, x: increment, momentum } = self;
+        let (nd, nk, ni) = (*nd, *nk, *ni);
+        let n = nd + nk;
+        assert_eq!((x.len(), u.len(), next.len()), (2 * n, ni + nk, 2 * n), "sizes of x, u, next");
+        let derivatives = match (means, generated, formed) {
+            (Means::Formed, _, Some(formed)) => {
+                let Formed { map, packed, .. } = &mut **formed;
+                map.apply(x, u, packed, next);
+                return;
+            }
+            (Means::Generated, Some(generated), _) => &mut generated.derivatives,
+            _ => {
+                next.fill(0.0);
+                return;
+            }
+        };
+        let (before, after) = (&x[..n], &u[ni..]);
+        by[..n + nd].copy_from_slice(&x[..n + nd]);
+        by[n + nd..].copy_from_slice(after);
+        for column in &ends.replaced {
+            by[n + nd + column - ni] = 0.0;
+        }
+        for impulse in &ends.inputs {
+            by[n + impulse.coordinate] += impulse.residual * u[impulse.input];
+        }
+        derivatives.push_forward(by, increment, momentum);
+        let rate = 1.0 / ends.time_step_s;
+        let (q, p) = next.split_at_mut(n);
+        q[..nd].copy_from_slice(increment);
+        q[nd..].copy_from_slice(&by[n + nd..]);
+        p[..nd].copy_from_slice(momentum);
+        q[..nd].iter_mut().zip(before).for_each(|(q, before)| *q += before);
+        for k in nd..n {
+            p[k] = (q[k] - before[k]) * rate;
+        }
+        for t in &ends.turnings {
+            let (i, start) = (t.coordinate, three(before, t.coordinate));
+            if i < nd {
+                let end = t.to_end.apply(three(increment, i)) + t.carried.apply(start);
+                q[i..i + 3].copy_from_slice(&end.0);
+            } else {
+                let turned = t.momentum.apply(three(q, i)) - t.momentum.apply_transposed(start);
+                p[i..i + 3].copy_from_slice(&(turned * rate).0);
+            }
+        }
+        for impulse in &ends.inputs {
+            p[impulse.coordinate] += (impulse.momentum - impulse.residual) * u[impulse.input];
+        }
+    }
+
+    /// `Aᵀ z` into `by_x` and `Bᵀ z` into `by_u`: the gradient by state and input of whatever has the gradient `z` by
+    /// the next state.
+    ///
+    /// # Panics
+    ///
+    /// If `z` and `by_x` do not have the `2 nd + 2 nk` entries of a state, or `by_u` not the `ni + nk` of an input.
+    pub fn pull_back(&mut self, z: &[f64], by_x: &mut [f64], by_u: &mut [f64]) {
+        let Self { nd, nk, ni, ends, means, generated, formed, by, x, momentum } = self;
+        let (nd, nk, ni) = (*nd, *nk, *ni);
+        let n = nd + nk;
+        assert_eq!(
+            (z.len(), by_x.len(), by_u.len()),
+            (2 * n, 2 * n, ni + nk),
+            "sizes of z, by_x, by_u"
+        );
+        by_x.fill(0.0);
+        by_u.fill(0.0);
+        let derivatives = match (means, generated, formed) {
+            (Means::Formed, _, Some(formed)) => {
+                let Formed { map, packed, .. } = &mut **formed;
+                map.add_pulled_back(z, packed, by_x, by_u);
+                return;
+            }
+            (Means::Generated, Some(generated), _) => &mut generated.derivatives,
+            _ => return,
+        };
+        let rate = 1.0 / ends.time_step_s;
+        let (q, p) = z.split_at(n);
+        x.copy_from_slice(&q[..nd]);
+        momentum.copy_from_slice(&p[..nd]);
+        for t in ends.turnings.iter().filter(|t| t.coordinate < nd) {
+            let i = t.coordinate;
+            x[i..i + 3].copy_from_slice(&t.to_end.apply_transposed(three(q, i)).0);
+        }
+        derivatives.pull_back(x, momentum, by);
+        by_x[..n + nd].copy_from_slice(&by[..n + nd]);
+        by_u[ni..].copy_from_slice(&by[n + nd..]);
+        by_x[..nd].iter_mut().zip(q).for_each(|(by, q)| *by += q);
+        for k in nd..n {
+            by_x[k] -= p[k] * rate;
+            by_u[ni + k - nd] += q[k] + p[k] * rate;
+        }
+        for t in &ends.turnings {
+            let i = t.coordinate;
+            if i < nd {
+                let carried = three(by, i) + t.carried.apply_transposed(three(q, i));
+                by_x[i..i + 3].copy_from_slice(&carried.0);
+            } else {
+                let (own, turned) = (three(q, i), three(p, i) * rate);
+                let start = three(by, i) - t.momentum.apply(turned);
+                let end = three(by, n + i) + own + t.momentum.apply_transposed(turned);
+                by_x[i..i + 3].copy_from_slice(&start.0);
+                by_u[ni + i - nd..][..3].copy_from_slice(&end.0);
+            }
+        }
+        for impulse in &ends.inputs {
+            let i = impulse.coordinate;
+            by_u[impulse.input] +=
+                impulse.residual * by[n + i] + (impulse.momentum - impulse.residual) * p[i];
+        }
+        for column in &ends.replaced {
+            by_u[*column] = 0.0;
+        }
+    }
+}
+
+impl Workspace {
+    /// Differentiates by generators at the solution in the workspace, where [`is_generated`] is true.
+    pub(crate) fn differentiate(
+        &mut self,
+        at: StepContext<'_>,
+        out: &mut StepDerivative,
+    ) -> Result<(), StepError> {
+        let StepContext { model, settings, .. } = at;
+        let StepDerivative { ends, generated, x, momentum, .. } = out;
+        let has_fields = self.kkt.fields.is_some() || !model.has_fields();
+        let Generated { derivatives, fields } = &mut **generated.get_or_insert_with(|| {
+            Box::new(Generated {
+                derivatives: Derivatives::new(model),
+                fields: (!has_fields).then(|| Box::new(Fields::new(model))),
+            })
+        });
+        ends.time_step_s = settings.time_step_s;
+        ends.at_start = settings.force_split.at_start();
+        if !self.step.is_evaluated {
+            self.evaluate(model, settings, at.state);
+        }
+        self.response.save_first(&mut self.kkt);
+        if model.planar.is_some() {
+            let mid = &mut self.mid;
+            let motion = [&mid.angles[..], &mid.velocity];
+            mid.mechanics.differentiate_in_space(model, motion, &mid.orientations, [x, momentum]);
+        } else {
+            self.mid.mechanics.differentiate(model);
+        }
+        if !has_fields {
+            std::mem::swap(&mut self.kkt.fields, fields);
+        }
+        let result = self.differentiate_in_space(at, ends, derivatives);
+        if !has_fields {
+            std::mem::swap(&mut self.kkt.fields, fields);
+        }
+        result?;
+        out.means = Means::Generated;
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::lagrangian::samples::oblique;
+    use crate::plant::facade::Plant;
+    use plantd_scene::builtin;
+
+    /// Trees in planes and in space go without matrices; what has constraints, several steps or stages does not.
+    #[test]
+    fn trees_need_no_matrices() {
+        let builtin = |name: &str| Model::compile(&builtin::scene(name).unwrap()).unwrap();
+        for (model, order, is_generated) in [
+            (builtin("pendulum"), 2, true),
+            (builtin("chain-8"), 2, true),
+            (builtin("cart-pole"), 2, true),
+            (oblique(5, ""), 2, true),
+            (builtin("balls-3"), 2, true),
+            (builtin("chain-8"), 4, false),
+            (builtin("four-bar"), 2, false),
+            (builtin("marionette"), 2, false),
+        ] {
+            let model = Arc::new(model);
+            let name = &model.scene.name;
+            let settings = Settings { order, ..Settings::new(&model) };
+            let mut plant = Plant::new(Arc::clone(&model), settings).unwrap();
+            let mut u = vec![0.0; model.dimensions.input()];
+            plant.hold_input(&mut u);
+            let mut out = StepDerivative::new(&model);
+            plant.differentiate(&u, &mut out).unwrap();
+            assert_eq!(matches!(out.means, Means::Generated), is_generated, "{name}");
+            assert_eq!(out.formed.is_none(), is_generated, "{name}");
+        }
+    }
+
+    /// Before a step was differentiated, and after one could not be.
+    #[test]
+    fn without_a_step_it_is_zero() {
+        let model = Arc::new(oblique(3, ""));
+        let mut out = StepDerivative::new(&model);
+        let zero_at = |out: &mut StepDerivative| {
+            let mut next = [f64::NAN; 6];
+            out.push_forward(&[1.0; 6], &[], &mut next);
+            next == [0.0; 6]
+        };
+        assert!(zero_at(&mut out));
+        let mut plant = Plant::new(Arc::clone(&model), Settings::new(&model)).unwrap();
+        plant.differentiate(&[], &mut out).unwrap();
+        assert!(!zero_at(&mut out));
+        assert!(plant.differentiate(&[0.0], &mut out).is_err());
+        assert!(zero_at(&mut out));
+    }
+}
