@@ -1,4 +1,4 @@
-//! How the time of a step, of A and B, and the memory of a plant grow with a rope in space that has what sends other
+//! How the time of a step, of A and B, of products with them, and the memory of a plant grow with a rope in space that has what sends other
 //! programs to dense matrices: a top that is moved, a ball joint, and a spring from its tip to the world.
 //!
 //! `cargo run --release -p plantd-models --example growth`
@@ -7,7 +7,9 @@ use std::error::Error;
 use std::hint::black_box;
 use std::sync::Arc;
 
-use plantd_models::{Layout, Linearization, Model, Plant, Scene, Settings, StepError};
+use plantd_models::{
+    Layout, Linearization, Model, Plant, Scene, Settings, StepDerivative, StepError,
+};
 
 /// Joints; the ball joint has three.
 const SIZES: [usize; 4] = [64, 128, 256, 512];
@@ -98,8 +100,10 @@ fn exponent(numbers: &[f64]) -> f64 {
 }
 
 fn main() -> Result<(), Box<dyn Error>> {
-    let mut all: [Vec<f64>; 3] = Default::default();
-    println!("joints   step, µs   step, A and B, µs   memory of a plant, KiB");
+    let mut all: [Vec<f64>; 6] = Default::default();
+    println!(
+        "µs       step   + A and B   + derivative as map   a product   transposed   plant, KiB"
+    );
     for joints in SIZES {
         let model = Arc::new(Model::compile(&rope(joints)?)?);
         let settings = Settings::new(&model);
@@ -127,10 +131,32 @@ fn main() -> Result<(), Box<dyn Error>> {
             black_box((&a, &b));
             Ok(())
         })?;
-        println!("{joints:6} {step:10.1} {linearized:19.1} {memory:24.0}");
-        all.iter_mut().zip([step, linearized, memory]).for_each(|(all, own)| all.push(own));
+        let mut map = StepDerivative::new(&model);
+        let differentiated = shortest_us(&mut plant, 100, |plant, u| {
+            plant.step_and_differentiate(u, &mut map).map(drop)
+        })?;
+        let x: Vec<f64> = (0..d.state()).map(|i| (i as f64).sin()).collect();
+        let (mut next, mut by_u) = (vec![0.0; d.state()], vec![0.0; d.input()]);
+        let pushed = shortest_us(&mut plant, 1000, |_, u| {
+            map.push_forward(black_box(&x), u, &mut next);
+            black_box(&next);
+            Ok(())
+        })?;
+        let pulled = shortest_us(&mut plant, 1000, |_, _| {
+            map.pull_back(black_box(&x), &mut next, &mut by_u);
+            black_box((&next, &by_u));
+            Ok(())
+        })?;
+        println!(
+            "{joints:4} {step:8.1} {linearized:11.1} {differentiated:21.1} {pushed:11.2} {pulled:12.2} {memory:12.0}"
+        );
+        let row = [step, linearized, differentiated, pushed, pulled, memory];
+        all.iter_mut().zip(row).for_each(|(all, own)| all.push(own));
     }
-    let [step, linearized, memory] = all.map(|numbers| exponent(&numbers));
-    println!("growth   n^{step:.2}     n^{linearized:.2}              n^{memory:.2}");
+    let [step, linearized, differentiated, pushed, pulled, memory] =
+        all.map(|numbers| exponent(&numbers));
+    println!(
+        "n^{step:10.2} {linearized:11.2} {differentiated:21.2} {pushed:11.2} {pulled:12.2} {memory:12.2}"
+    );
     Ok(())
 }
