@@ -7,7 +7,7 @@ use plantd_math::elimination::SymbolicElimination;
 
 use crate::integrator::workspace::Workspace;
 use crate::kkt::held::MOST;
-use crate::model::held::{Held, HeldLimb};
+use crate::model::held::{Held, HeldLimb, Run};
 use crate::model::mechanism::{Model, Solver};
 
 impl Model {
@@ -33,59 +33,117 @@ impl Model {
         if d.constraints == 0 || d.prescribed > 0 || self.constraint_rank() < d.constraints {
             return None;
         }
-        let (mut limbs, mut begin) = (Vec::<HeldLimb>::new(), 0);
-        while let Some(first) = self.constraints.get(begin) {
-            let moved: BTreeSet<usize> = first.coordinates.iter().copied().collect();
-            let alike = self.constraints[begin..].iter().take_while(|constraint| {
-                constraint.coordinates.iter().copied().collect::<BTreeSet<_>>() == moved
-            });
-            let equations = begin..begin + alike.count();
-            begin = equations.end;
-            limbs.push(self.held_limb(equations, &moved)?);
+        let mut groups: Vec<Equations> = Vec::new();
+        for (c, constraint) in self.constraints.iter().enumerate() {
+            let moved: BTreeSet<usize> = constraint.coordinates.iter().copied().collect();
+            match groups.last_mut().filter(|group| group.moved == moved) {
+                Some(group) => group.range.end = c + 1,
+                None => groups.push(Equations { range: c..c + 1, moved }),
+            }
+        }
+        let mut limbs = Vec::new();
+        for (at, group) in groups.iter().enumerate() {
+            let others = groups.iter().enumerate().filter(|(other, _)| *other != at);
+            let is_wanted = |i: &usize| others.clone().any(|(_, other)| other.moved.contains(i));
+            let ends = self.ends(&group.moved);
+            let mut found = ends.filter_map(|last| self.held_limb(group, last));
+            limbs.push(found.find(|limb| !limb.coordinates.clone().any(|i| is_wanted(&i)))?);
         }
         for at in 1..limbs.len() {
-            let differs = limbs[at - 1].above != limbs[at].above;
+            let differs = limbs[at - 1].border != limbs[at].border;
             (limbs[at - 1].is_last, limbs[at].is_first) = (differs, differs);
         }
-        // No limb is above another row, nor moves another's equations.
-        let is_held = |row: &usize| limbs.iter().any(|limb| limb.coordinates.contains(row));
-        let SymbolicElimination { offsets, ancestors, .. } = &self.elimination;
-        let proper = |k: usize| -> BTreeSet<usize> {
-            ancestors[offsets[k]..offsets[k + 1] - 1].iter().copied().collect()
-        };
-        let are_last = limbs.iter().all(|limb| limb.above.iter().all(|above| !is_held(above)));
-        let others = (0..d.dynamic).filter(|k| !is_held(k));
-        // Nor have two the same coordinates: equations that move the same end may move different others.
-        let owned: usize = limbs.iter().map(|limb| limb.coordinates.len()).sum();
-        let are_apart = owned == (0..d.dynamic).filter(is_held).count();
-        if !are_last || !are_apart || others.clone().any(|k| proper(k).iter().any(is_held)) {
-            return None;
+        // Nothing of the rest hangs from a limb, and no limb is held by another one.
+        let held: BTreeSet<usize> =
+            limbs.iter().flat_map(|limb| limb.coordinates.clone()).collect();
+        let is_held = |row: &usize| held.contains(row);
+        let mut rest: Vec<BTreeSet<usize>> = Vec::new();
+        for k in 0..d.dynamic {
+            let above = self.above(k);
+            match is_held(&k) {
+                true => rest.push(BTreeSet::new()),
+                false if above.iter().any(is_held) => return None,
+                false => rest.push(above.iter().copied().collect()),
+            }
         }
-        let rest = (0..d.dynamic).map(|k| if is_held(&k) { BTreeSet::new() } else { proper(k) });
-        let rest = SymbolicElimination::new(&rest.collect::<Vec<_>>());
+        for limb in &limbs {
+            if limb.border.iter().any(is_held) {
+                return None;
+            }
+            for later in &limb.border {
+                rest[*later].extend(limb.border.iter().filter(|earlier| *earlier < later));
+            }
+        }
+        let rest = SymbolicElimination::new(&rest);
+        for limb in &mut limbs {
+            for (row, column) in
+                limb.border.iter().flat_map(|i| limb.border.iter().map(move |k| (i, k)))
+            {
+                limb.places.push(rest.slot(*row.max(column), *row.min(column))?);
+            }
+        }
+        let mut kept: Vec<Run> = Vec::new();
+        let offsets = &self.elimination.offsets;
+        for k in (0..d.dynamic).filter(|k| !is_held(k)) {
+            for from in offsets[k]..offsets[k + 1] {
+                let to = rest.slot(k, self.elimination.ancestors[from])?;
+                match kept.last_mut() {
+                    Some(Run { from: a, to: b, len }) if (*a + *len, *b + *len) == (from, to) => {
+                        *len += 1;
+                    }
+                    _ => kept.push(Run { from, to, len: 1 }),
+                }
+            }
+        }
         let inertia = self.conditioning.inertia.iter().enumerate();
         let inertia = inertia.map(|(k, inertia)| if is_held(&k) { 0.0 } else { *inertia });
-        Some(Held { inertia: inertia.collect(), limbs, rest })
+        Some(Held { inertia: inertia.collect(), limbs, rest, kept })
     }
 
-    /// The limb that equations hold which some coordinates change.
-    fn held_limb(&self, equations: Range<usize>, moved: &BTreeSet<usize>) -> Option<HeldLimb> {
-        let (last, count) = (*moved.last()?, equations.len());
+    /// The coordinates above one in its elimination.
+    fn above(&self, k: usize) -> &[usize] {
         let SymbolicElimination { offsets, ancestors, .. } = &self.elimination;
-        let chain = &ancestors[offsets[last]..offsets[last + 1]];
-        let begin = chain.len().checked_sub(count).filter(|begin| *begin > 0)?;
-        let (above, own) = chain.split_at(begin);
-        let follow = own.iter().zip(own[0]..).all(|(own, next)| *own == next);
-        let is_moved_here = moved.iter().all(|i| chain.binary_search(i).is_ok());
-        if count > MOST || !follow || !is_moved_here {
+        &ancestors[offsets[k]..offsets[k + 1] - 1]
+    }
+
+    /// The lowest of some coordinates in each of the two chains that they are in, the last one first.
+    fn ends(&self, moved: &BTreeSet<usize>) -> impl Iterator<Item = usize> {
+        let last = moved.last().copied();
+        let is_apart =
+            move |i: &&usize| last.is_some_and(|k| k != **i && !self.above(k).contains(i));
+        let other = moved.iter().rev().find(is_apart).copied();
+        [last, other].into_iter().flatten()
+    }
+
+    /// The limb that ends in a coordinate and is held by equations.
+    fn held_limb(&self, equations: &Equations, last: usize) -> Option<HeldLimb> {
+        let Equations { range, moved } = equations;
+        let (above, count) = (self.above(last), range.len());
+        let begin = (above.len() + 1).checked_sub(count)?;
+        let (above, own) = above.split_at(begin.min(above.len()));
+        let first = own.first().copied().unwrap_or(last);
+        let follow = own.iter().chain([&last]).zip(first..).all(|(own, next)| *own == next);
+        let coordinates = first..last + 1;
+        let is_other = |i: &&usize| !above.contains(i) && !coordinates.contains(i);
+        let mut border = above.to_vec();
+        border.extend(moved.iter().filter(is_other));
+        if count > MOST || !follow || border.is_empty() {
             return None;
         }
         Some(HeldLimb {
-            coordinates: own[0]..last + 1,
-            equations,
-            above: above.to_vec(),
+            equations: range.clone(),
+            above: above.len(),
+            places: Vec::new(),
             is_first: true,
             is_last: true,
+            coordinates,
+            border,
         })
     }
+}
+
+/// Equations that the same coordinates change.
+struct Equations {
+    range: Range<usize>,
+    moved: BTreeSet<usize>,
 }

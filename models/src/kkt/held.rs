@@ -1,7 +1,8 @@
 //! Limbs whose ends are held, such as legs on the ground, eliminated with the equations that hold them.
 //!
-//! As many equations as the last coordinates `l` of a chain, which depend on no others but those above, `b`, say
-//! where the limb goes with what carries it. With the blocks `A1_l` and `A0_l` of the Jacobians,
+//! As many equations as the last coordinates `l` of a chain say where the limb goes with the other coordinates that it
+//! has to do with, its border `b`: those above, which carry it, and those that move the place where it is held, as the
+//! platform of a parallel robot does. With the blocks `A1_l` and `A0_l` of the Jacobians,
 //!
 //! ```text
 //! K y + A0ᵀ λ = r1                     G1 = A1_l⁻¹ A1_b      G0 = A0_l⁻¹ A0_b
@@ -13,7 +14,7 @@
 //! ```
 //!
 //! What is left is a matrix of the other coordinates, and no equation: the change of a limb stays among the rows of
-//! the chain that carries it. Where `A_l` is next to singular, as that of a straight leg, all equations are taken
+//! its border. Where `A_l` is next to singular, as that of a straight leg, all equations are taken
 //! together.
 
 #[cfg(test)]
@@ -25,7 +26,7 @@ use plantd_math::spatial::Vec3;
 use plantd_math::tree_lu::{SmallestPivot, TreeLu};
 
 use crate::constraints::closure::Closure;
-use crate::model::held::{Held, HeldLimb};
+use crate::model::held::{Held, HeldLimb, Run};
 use crate::model::mechanism::Model;
 
 /// Equations of a limb, at most.
@@ -44,13 +45,13 @@ struct Factors<const N: usize> {
     inverses: [Square<N>; 2],
     /// `K_ll`.
     own: Square<N>,
-    /// By the coordinates above, eight at a time.
-    above: Vec<Above<N>>,
+    /// By the coordinates of the border, eight at a time.
+    border: Vec<Border<N>>,
 }
 
-/// Rows of a limb, by eight of the coordinates above.
+/// Rows of a limb, by eight coordinates of its border.
 #[derive(Clone, Copy, Debug)]
-struct Above<const N: usize> {
+struct Border<const N: usize> {
     /// `G0` and `G1`.
     start: [Block; N],
     end: [Block; N],
@@ -83,7 +84,7 @@ macro_rules! of_limb {
 pub(crate) struct HeldLimbs {
     limbs: Vec<Limb>,
     rest: TreeLu,
-    /// What limbs that hang from the same coordinates make of these, in their rows and columns.
+    /// What limbs with the same border make of its coordinates, in their rows and columns.
     sums: Vec<Block>,
 }
 
@@ -98,7 +99,7 @@ pub(crate) struct Pivots {
 
 impl HeldLimbs {
     pub(crate) fn new(held: &Held) -> Self {
-        let most = held.limbs.iter().map(|limb| limb.above.len()).max().unwrap_or_default();
+        let most = held.limbs.iter().map(|limb| limb.border.len()).max().unwrap_or_default();
         let limb = |limb: &HeldLimb| match limb.equations.len() {
             3 => Limb::Three(Box::new(Factors::new(limb))),
             _ => Limb::Six(Box::new(Factors::new(limb))),
@@ -120,7 +121,7 @@ impl HeldLimbs {
         closures: [&Closure; 2],
         step: f64,
     ) -> Pivots {
-        self.take_rest(model, held, matrix);
+        self.take_rest(held, matrix);
         let equations = in_eights(Eliminate { limbs: self, model, held, matrix, closures });
         let scale = 1.0 / step.abs();
         let is_sound = equations >= SOUND;
@@ -151,33 +152,30 @@ impl HeldLimbs {
     }
 
     /// Takes the entries of `K` of which no coordinate is a limb's.
-    fn take_rest(&mut self, model: &Model, held: &Held, matrix: &TreeLu) {
-        let offsets = &model.elimination.offsets;
-        for (from, to) in offsets.windows(2).zip(held.rest.offsets.windows(2)) {
-            let (from, to) = (from[0]..from[1], to[0]..to[1]);
-            if from.len() == to.len() {
-                self.rest.upper[to.clone()].copy_from_slice(&matrix.upper[from.clone()]);
-                self.rest.lower[to].copy_from_slice(&matrix.lower[from]);
-            } else {
-                self.rest.upper[to].fill(1.0);
-            }
+    fn take_rest(&mut self, held: &Held, matrix: &TreeLu) {
+        let TreeLu { upper, lower, .. } = &mut self.rest;
+        upper.fill(0.0);
+        lower.fill(0.0);
+        for &Run { from, to, len } in &held.kept {
+            upper[to..to + len].copy_from_slice(&matrix.upper[from..from + len]);
+            lower[to..to + len].copy_from_slice(&matrix.lower[from..from + len]);
+        }
+        for i in held.limbs.iter().flat_map(|limb| limb.coordinates.clone()) {
+            upper[held.rest.offsets[i]] = 1.0;
         }
     }
 
-    /// Adds what limbs make of the coordinates above them, and begins anew.
+    /// Adds what limbs make of their border, and begins anew.
     #[inline(always)]
-    fn put_sums(&mut self, plan: &HeldLimb, held: &Held) {
-        let width = plan.above.len().div_ceil(LANES);
-        let offsets = &held.rest.offsets;
-        for (d, &i) in plan.above.iter().enumerate() {
+    fn put_sums(&mut self, plan: &HeldLimb) {
+        let width = plan.border.len().div_ceil(LANES);
+        let mut places = plan.places.iter();
+        for (d, i) in plan.border.iter().enumerate() {
             let row = &mut self.sums[d * width..][..width];
-            for (e, &k) in plan.above.iter().enumerate() {
+            for ((e, k), place) in plan.border.iter().enumerate().zip(&mut places) {
                 let sum = row[e / LANES].0[e % LANES];
-                if e < d {
-                    self.rest.lower[offsets[i] + e] += sum;
-                } else {
-                    self.rest.upper[offsets[k] + d] += sum;
-                }
+                let triangle = if k < i { &mut self.rest.lower } else { &mut self.rest.upper };
+                triangle[*place] += sum;
             }
             row.fill(Block::ZERO);
         }
@@ -288,11 +286,11 @@ fn inverse<const N: usize>(mut matrix: Square<N>) -> Option<Square<N>> {
 impl<const N: usize> Factors<N> {
     fn new(plan: &HeldLimb) -> Self {
         let rows = [Block::ZERO; N];
-        let above = Above { start: rows, end: rows, upper: rows, lower: rows };
+        let border = Border { start: rows, end: rows, upper: rows, lower: rows };
         Self {
             inverses: [[[0.0; N]; N]; 2],
             own: [[0.0; N]; N],
-            above: vec![above; plan.above.len().div_ceil(LANES)],
+            border: vec![border; plan.border.len().div_ceil(LANES)],
         }
     }
 
@@ -334,7 +332,7 @@ impl<const N: usize> Factors<N> {
         matrix: &TreeLu,
         [start, end]: [&Closure; 2],
     ) {
-        let (n, count) = (model.dimensions.coordinates(), plan.above.len());
+        let (n, count) = (model.dimensions.coordinates(), plan.above);
         let offsets = &model.elimination.offsets;
         for (a, i) in plan.coordinates.clone().enumerate() {
             for b in 0..=a {
@@ -342,19 +340,20 @@ impl<const N: usize> Factors<N> {
                 self.own[b][a] = matrix.upper[offsets[i] + count + b];
             }
         }
-        for (above, (place, rows)) in
-            plan.above.chunks(LANES).zip((0..).step_by(LANES).zip(&mut self.above))
+        for (border, (place, rows)) in
+            plan.border.chunks(LANES).zip((0..).step_by(LANES).zip(&mut self.border))
         {
             let [mut by_start, mut by_end] = [[Block::ZERO; N]; 2];
             for (k, c) in plan.equations.clone().enumerate() {
                 let entries = [start, end].map(|closure| &closure.jacobian[c * n..][..n]);
-                for (lane, &i) in above.iter().enumerate() {
+                for (lane, &i) in border.iter().enumerate() {
                     by_start[k].0[lane] = entries[0][i];
                     by_end[k].0[lane] = entries[1][i];
                 }
             }
             for (k, i) in plan.coordinates.clone().enumerate() {
-                let slots = offsets[i] + place..offsets[i] + place + above.len();
+                // Of what moves the place where it is held alone, there is nothing.
+                let slots = offsets[i] + place.min(count)..offsets[i] + count.min(place + LANES);
                 rows.upper[k].0 = taken(&matrix.upper[slots.clone()]);
                 rows.lower[k].0 = taken(&matrix.lower[slots]);
             }
@@ -375,11 +374,11 @@ impl<const N: usize> Factors<N> {
     /// Adds `−K_bl G1 − G0ᵀ E`.
     #[inline(always)]
     fn change<E: Eight>(&self, plan: &HeldLimb, sums: &mut [Block]) {
-        let width = self.above.len();
-        for (column, rows) in self.above.iter().enumerate() {
+        let width = self.border.len();
+        for (column, rows) in self.border.iter().enumerate() {
             let (end, lower) = (loaded::<E, N>(&rows.end), loaded::<E, N>(&rows.lower));
-            for d in 0..plan.above.len() {
-                let (from, lane) = (&self.above[d / LANES], d % LANES);
+            for d in 0..plan.border.len() {
+                let (from, lane) = (&self.border[d / LANES], d % LANES);
                 let sum = &mut sums[d * width + column];
                 let [mut by_end, mut by_lower] = [E::of(sum), E::ZERO];
                 for k in 0..N {
@@ -391,7 +390,7 @@ impl<const N: usize> Factors<N> {
         }
     }
 
-    /// `c` and `s` in place of right-hand sides, and what they give to the coordinates above.
+    /// `c` and `s` in place of right-hand sides, and what they give to those of the border.
     #[inline(always)]
     fn lift<E: Eight>(&self, own: &mut [f64], lambda: &mut [f64], flow: &mut [Block]) {
         let (right, mut s, mut c) = (taken(lambda), taken(own), [0.0; N]);
@@ -401,7 +400,7 @@ impl<const N: usize> Factors<N> {
         for (s, own) in s.iter_mut().zip(&self.own) {
             *s -= dot(own, &c);
         }
-        for (rows, flow) in self.above.iter().zip(flow) {
+        for (rows, flow) in self.border.iter().zip(flow) {
             let upper = sum_of(&loaded::<E, N>(&rows.upper), &c);
             let start = sum_of(&loaded::<E, N>(&rows.start), &s);
             E::of(flow).plus(upper.plus(start)).put(flow);
@@ -410,15 +409,15 @@ impl<const N: usize> Factors<N> {
         put(s, own);
     }
 
-    /// The solution, from `c`, `s` and that of the coordinates above.
+    /// The solution, from `c`, `s` and that of the border.
     #[inline(always)]
-    fn lower<E: Eight>(&self, own: &mut [f64], lambda: &mut [f64], above: &[Block]) {
+    fn lower<E: Eight>(&self, own: &mut [f64], lambda: &mut [f64], border: &[Block]) {
         let (mut y, mut pushed) = (taken::<N>(lambda), taken::<N>(own));
-        for (rows, above) in self.above.iter().zip(above) {
-            let above = E::of(above);
+        for (rows, border) in self.border.iter().zip(border) {
+            let border = E::of(border);
             for k in 0..N {
-                y[k] -= E::of(&rows.end[k]).dot(above);
-                pushed[k] -= E::of(&rows.lower[k]).dot(above);
+                y[k] -= E::of(&rows.end[k]).dot(border);
+                pushed[k] -= E::of(&rows.lower[k]).dot(border);
             }
         }
         put(y, own);
@@ -431,20 +430,19 @@ impl<const N: usize> Factors<N> {
         put(multipliers, lambda);
     }
 
-    /// [`Self::lift`] for eight right-hand sides; `above` are the rows of all coordinates above the limb's.
+    /// [`Self::lift`] for eight right-hand sides; `x` has rows of all coordinates.
     #[inline(always)]
     fn lift_rows<E: Eight>(
         &self,
         plan: &HeldLimb,
-        above: &mut [f64],
-        [own, lambda]: [&mut [f64]; 2],
+        x: &mut [f64],
+        lambda: &mut [f64],
         stride: usize,
     ) {
-        let size = plan.equations.len();
         let [mut c, mut s, mut right] = [[E::ZERO; N]; 3];
-        for k in 0..size {
+        for (k, i) in plan.coordinates.clone().enumerate() {
             right[k] = E::of_list(&lambda[k * stride..][..LANES]);
-            s[k] = E::of_list(&own[k * stride..][..LANES]);
+            s[k] = E::of_list(&x[i * stride..][..LANES]);
         }
         for (c, inverse) in c.iter_mut().zip(&self.inverses[1]) {
             *c = sum_of(&right, inverse);
@@ -452,9 +450,9 @@ impl<const N: usize> Factors<N> {
         for (s, own) in s.iter_mut().zip(&self.own) {
             *s = s.minus(sum_of(&c, own));
         }
-        for (&i, d) in plan.above.iter().zip(0..) {
-            let (rows, lane) = (&self.above[d / LANES], d % LANES);
-            let target = &mut above[i * stride..][..LANES];
+        for (&i, d) in plan.border.iter().zip(0..) {
+            let (rows, lane) = (&self.border[d / LANES], d % LANES);
+            let target = &mut x[i * stride..][..LANES];
             let [mut upper, mut start] = [E::of_list(target), E::ZERO];
             for k in 0..N {
                 upper = upper.minus(c[k].scaled(rows.upper[k].0[lane]));
@@ -462,9 +460,9 @@ impl<const N: usize> Factors<N> {
             }
             upper.minus(start).put_list(target);
         }
-        for k in 0..size {
+        for (k, i) in plan.coordinates.clone().enumerate() {
             c[k].put_list(&mut lambda[k * stride..][..LANES]);
-            s[k].put_list(&mut own[k * stride..][..LANES]);
+            s[k].put_list(&mut x[i * stride..][..LANES]);
         }
     }
 
@@ -473,26 +471,25 @@ impl<const N: usize> Factors<N> {
     fn lower_rows<E: Eight>(
         &self,
         plan: &HeldLimb,
-        above: &[f64],
-        [own, lambda]: [&mut [f64]; 2],
+        x: &mut [f64],
+        lambda: &mut [f64],
         stride: usize,
     ) {
-        let size = plan.equations.len();
         let [mut y, mut pushed] = [[E::ZERO; N]; 2];
-        for k in 0..size {
+        for (k, i) in plan.coordinates.clone().enumerate() {
             y[k] = E::of_list(&lambda[k * stride..][..LANES]);
-            pushed[k] = E::of_list(&own[k * stride..][..LANES]);
+            pushed[k] = E::of_list(&x[i * stride..][..LANES]);
         }
-        for (&i, d) in plan.above.iter().zip(0..) {
-            let (rows, lane) = (&self.above[d / LANES], d % LANES);
-            let at = E::of_list(&above[i * stride..][..LANES]);
+        for (&i, d) in plan.border.iter().zip(0..) {
+            let (rows, lane) = (&self.border[d / LANES], d % LANES);
+            let at = E::of_list(&x[i * stride..][..LANES]);
             for k in 0..N {
                 y[k] = y[k].minus(at.scaled(rows.end[k].0[lane]));
                 pushed[k] = pushed[k].minus(at.scaled(rows.lower[k].0[lane]));
             }
         }
-        for k in 0..size {
-            y[k].put_list(&mut own[k * stride..][..LANES]);
+        for (k, i) in plan.coordinates.clone().enumerate() {
+            y[k].put_list(&mut x[i * stride..][..LANES]);
             let mut sum = E::ZERO;
             for (pushed, inverse) in pushed.iter().zip(&self.inverses[0]) {
                 sum = sum.plus(pushed.scaled(inverse[k]));
@@ -532,7 +529,7 @@ impl InEights for Eliminate<'_> {
                 limb.change::<E>(plan, sums);
             });
             if plan.is_last {
-                limbs.put_sums(plan, held);
+                limbs.put_sums(plan);
             }
         }
         equations
@@ -554,7 +551,7 @@ impl InEights for Lift<'_> {
     fn run<E: Eight>(self) {
         let Self { limbs: HeldLimbs { limbs, sums, .. }, held, x, lambda } = self;
         for (plan, limb) in held.limbs.iter().zip(&*limbs) {
-            let flow = &mut sums[..plan.above.len().div_ceil(LANES)];
+            let flow = &mut sums[..plan.border.len().div_ceil(LANES)];
             let (own, lambda) =
                 (&mut x[plan.coordinates.clone()], &mut lambda[plan.equations.clone()]);
             if plan.is_first {
@@ -562,8 +559,8 @@ impl InEights for Lift<'_> {
             }
             of_limb!(limb, limb => limb.lift::<E>(own, lambda, flow));
             if plan.is_last {
-                for (above, flow) in plan.above.chunks(LANES).zip(&*flow) {
-                    above.iter().zip(flow.0).for_each(|(&i, flow)| x[i] -= flow);
+                for (border, flow) in plan.border.chunks(LANES).zip(&*flow) {
+                    border.iter().zip(flow.0).for_each(|(&i, flow)| x[i] -= flow);
                 }
             }
         }
@@ -585,11 +582,11 @@ impl InEights for Lower<'_> {
     fn run<E: Eight>(self) {
         let Self { limbs: HeldLimbs { limbs, sums, .. }, held, x, lambda } = self;
         for (plan, limb) in held.limbs.iter().zip(&*limbs) {
-            let flow = &mut sums[..plan.above.len().div_ceil(LANES)];
+            let flow = &mut sums[..plan.border.len().div_ceil(LANES)];
             if plan.is_first {
-                for (above, flow) in plan.above.chunks(LANES).zip(&mut *flow) {
+                for (border, flow) in plan.border.chunks(LANES).zip(&mut *flow) {
                     *flow = Block::ZERO;
-                    flow.0.iter_mut().zip(above).for_each(|(flow, &i)| *flow = x[i]);
+                    flow.0.iter_mut().zip(border).for_each(|(flow, &i)| *flow = x[i]);
                 }
             }
             let (own, lambda) =
@@ -599,7 +596,7 @@ impl InEights for Lower<'_> {
     }
 }
 
-/// One half of solutions side by side: `UP` to the coordinates above, or down from their solution.
+/// One half of solutions side by side: `UP` to the borders, or down from their solution.
 struct PassRows<'a, const UP: bool> {
     limbs: &'a HeldLimbs,
     held: &'a Held,
@@ -616,15 +613,13 @@ impl<const UP: bool> InEights for PassRows<'_, UP> {
     fn run<E: Eight>(self) {
         let Self { limbs, held, x, lambda, stride, columns } = self;
         for (plan, limb) in held.limbs.iter().zip(&limbs.limbs) {
-            let (above, own) = x.split_at_mut(plan.coordinates.start * stride);
             let lambda = &mut lambda[plan.equations.start * stride..];
             for column in (0..columns).step_by(LANES) {
-                let (above, own) = (&mut above[column..], &mut own[column..]);
-                let rows = [own, &mut lambda[column..]];
+                let (x, lambda) = (&mut x[column..], &mut lambda[column..]);
                 of_limb!(limb, limb => if UP {
-                    limb.lift_rows::<E>(plan, above, rows, stride);
+                    limb.lift_rows::<E>(plan, x, lambda, stride);
                 } else {
-                    limb.lower_rows::<E>(plan, above, rows, stride);
+                    limb.lower_rows::<E>(plan, x, lambda, stride);
                 });
             }
         }

@@ -75,6 +75,18 @@ impl Sketch {
         writeln!(self.constraints, "[[constraints]]\nname = \"hold{name}\"\n{constraint}").unwrap();
     }
 
+    /// Holds a point of the last body, which is at a place, at a body that is not turned.
+    fn join(&mut self, [own, at]: [[f64; 3]; 2], body: &str, place: [f64; 3]) {
+        let (name, frame) = (self.count, format!("f{}", self.count - 1));
+        let there = [0, 1, 2].map(|i| at[i] + own[i] - place[i]);
+        writeln!(
+            self.constraints,
+            "[[constraints]]\nname = \"join{name}\"\ntype = \"point_to_point\"\naxes = [\"x\", \"y\", \"z\"]\n\
+             a = {{ frame = \"{frame}\", at = {own:?} }}\nb = {{ frame = \"{body}\", at = {there:?} }}"
+        )
+        .unwrap();
+    }
+
     fn compile(&self, more: &str) -> Model {
         let text = format!(
             "format = 1\nname = \"held\"\ntime_step_s = 0.002\ngravity = [0.3, 0.0, -9.81]\n{more}\n{}{}{}",
@@ -136,6 +148,47 @@ fn carriage(bend: f64) -> Model {
     sketch.compile("")
 }
 
+/// Where the platform of a parallel robot hangs in the tree.
+#[derive(Clone, Copy, Debug)]
+enum Platform {
+    First,
+    Last,
+    /// At the end of a leg.
+    OnLeg,
+}
+
+/// A platform on legs that stand on the ground.
+fn parallel(platform: Platform) -> Model {
+    let mut sketch = Sketch::default();
+    let floats = [(FREE, [0.0, 0.0, 0.8])];
+    let on_leg = [
+        (X, [0.3, 0.1, 0.0]),
+        (Y, [0.0; 3]),
+        (SLIDE, [0.0, 0.0, 0.4]),
+        ("type = \"ball\"", [0.05, 0.0, 0.4]),
+    ];
+    let (place, body) = match platform {
+        Platform::First => (sketch.chain("world", [0.0; 3], &floats), "f0"),
+        Platform::Last => (floats[0].1, "f9"),
+        Platform::OnLeg => (sketch.chain("world", [0.0; 3], &on_leg), "f3"),
+    };
+    for (k, [x, y]) in [[-0.3, 0.2], [-0.2, -0.3], [0.2, -0.2]].into_iter().enumerate() {
+        let links = [(X, [x, y, 0.05]), (Y, [0.0, 0.02, 0.0]), (SLIDE, [0.03, 0.0, 0.3])];
+        let at = sketch.chain("world", [0.0; 3], &links);
+        sketch.join([[0.0, 0.01 * k as f64, 0.4], at], body, place);
+    }
+    if let Platform::Last = platform {
+        sketch.chain("world", [0.0; 3], &floats);
+    }
+    sketch.compile("damping = 0.02")
+}
+
+/// All that is eliminated limb by limb.
+fn models() -> [Model; 5] {
+    let [first, last, on_leg] = [Platform::First, Platform::Last, Platform::OnLeg].map(parallel);
+    [humanoid(), carriage(0.1), first, last, on_leg]
+}
+
 /// With limbs eliminated, and by the tree LU alone; moving.
 fn both(model: Model) -> [Plant; 2] {
     let model = Arc::new(model);
@@ -182,7 +235,7 @@ fn dense(workspace: &mut Workspace, model: &Model, settings: &Settings) -> DMatr
 
 #[test]
 fn a_solution_satisfies_the_dense_system() {
-    for model in [humanoid(), carriage(0.1)] {
+    for model in models() {
         assert_eq!(model.solver, Solver::Held);
         let [mut plant, _] = both(model);
         let Plant { model, settings, state, workspace, .. } = &mut plant;
@@ -205,7 +258,7 @@ fn a_solution_satisfies_the_dense_system() {
 
 #[test]
 fn limbs_move_and_linearize_as_by_the_tree() {
-    for model in [humanoid(), carriage(0.1)] {
+    for model in models() {
         let [mut fast, mut slow] = both(model);
         let [mut a, mut b] = [&fast, &slow].map(|plant| Linearization::new(plant.model()));
         let u = vec![0.0; fast.model().dimensions().input()];
@@ -279,7 +332,7 @@ fn straight_legs_are_left_to_the_tree() {
 /// Torques that change at each step are guessed, by the factors of the last step or by those that are made again.
 #[test]
 fn guesses_follow_from_the_state_alone() {
-    for model in [humanoid(), carriage(0.1)] {
+    for model in models() {
         let [mut plant, _] = both(model);
         let count = plant.model().dimensions().input();
         let input = |k: u32| -> Vec<f64> {
@@ -312,7 +365,7 @@ fn guesses_follow_from_the_state_alone() {
 
 #[test]
 fn wider_registers_give_the_same_bits() {
-    for model in [humanoid(), carriage(0.1)] {
+    for model in models() {
         let [wide, _] = both(model);
         let model = Arc::clone(wide.model());
         let u = vec![0.0; model.dimensions().input()];
