@@ -202,7 +202,7 @@ AB_METHODS = [
     ("MuJoCo", "euler-ab"),
 ]
 # Arms, floating robots and ball joints: motions of 2 ms steps, also with torques that change at each of them.
-ROBOTS = ["panda", "g1-fixed", "go1", "anymal", "g1", "talos", "go1-feet", "B7", "B15", "K8"]
+ROBOTS = ["panda", "g1-fixed", "go1", "anymal", "g1", "talos", "go1-feet", "stewart", "B7", "B15", "K8"]
 ROBOT_METHODS = [
     PLANTD,
     ("Pinocchio", "euler"),

@@ -311,7 +311,50 @@ def standing(name):
     return m | dict(name=name, q0=q0, v0=v0.tolist(), loops=loops)
 
 
-SINGLE = {"P": pendulum, "D": double_pendulum, "S": spherical_pendulum, "L": four_bar}
+def stewart():
+    """A platform on six legs, each a crank with a rod on a universal joint, whose end is held at the platform."""
+    import numpy as np
+
+    def turning(axis, angle):
+        c, s = math.cos(angle), math.sin(angle)
+        return np.array([[[1, 0, 0], [0, c, -s], [0, s, c]], [[c, 0, s], [0, 1, 0], [-s, 0, c]]][axis])
+
+    height, crank, lift = 0.5, 0.2, -0.3
+    platform = body(-1, [0, 0, 0], [0, 0, 0], 5.0, [0, 0, 0.03], [0.08, 0.08, 0.14], type="free")
+    bodies, loops = [platform], []
+    q0, v0 = [0, 0, height, 0, 0, 0], [0.1, 0.05, 0.08, 0.3, 0.2, -0.25]
+    for leg in range(6):
+        side = 1 if leg % 2 else -1
+        at, corner = [math.radians(120 * (leg // 2) + side * spread) for spread in (14, 46)]
+        base = [0.35 * math.cos(at), 0.35 * math.sin(at), 0.0]
+        corner = np.array([0.25 * math.cos(corner), 0.25 * math.sin(corner), 0.0])
+        c, s = math.cos(at), math.sin(at)
+        foot = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        on_crank = foot @ turning(1, lift)
+        knee = base + on_crank @ [crank, 0, 0]
+        tip = corner + [0, 0, height]
+        x, y, z = on_crank.T @ (tip - knee)
+        length, swing = math.sqrt(x * x + y * y + z * z), math.atan2(x, z)
+        tilt = -math.asin(y / length)
+        turn = [math.cos(at / 2), 0, 0, math.sin(at / 2)]
+        own, inertia = len(bodies), length**2 / 12 * 0.4
+        bodies += [
+            body(-1, base, [0, 1, 0], 0.6, [crank / 2, 0, 0], [0.0004, 0.002, 0.002], turn=turn),
+            body(own, [crank, 0, 0], [0, 1, 0], 0.05, [0, 0, 0], [1e-5, 1e-5, 1e-5]),
+            body(own + 1, [0, 0, 0], [1, 0, 0], 0.4, [0, 0, length / 2], [inertia, inertia, 5e-5]),
+        ]
+        # What the joints turn the tip by, and how the platform moves it.
+        on_cross = on_crank @ turning(1, swing)
+        arms = [(on_crank[:, 1], tip - base), (on_crank[:, 1], tip - knee), (on_cross[:, 0], tip - knee)]
+        by_joints = np.array([np.cross(axis, arm) for axis, arm in arms]).T
+        q0 += [lift, swing, tilt]
+        v0 += np.linalg.solve(by_joints, v0[:3] + np.cross(v0[3:6], corner)).tolist()
+        end = dict(body_a=own + 2, at_a=[0, 0, length], body_b=0, at_b=corner.tolist())
+        loops.append(end | dict(axes=["x", "y", "z"]))
+    return mechanism("stewart", bodies, q0, v0, loops) | dict(rough=[0] * 6 + [2.0, 0, 0] * 6)
+
+
+SINGLE = {"stewart": stewart, "P": pendulum, "D": double_pendulum, "S": spherical_pendulum, "L": four_bar}
 FAMILIES = {"B": ball_tree, "K": ball_chain, "C": chain, "H": hanging_chain, "T": tree, "X": scissor, "Z": chain_in_space}
 
 
