@@ -232,9 +232,25 @@ fn check_second_order_with(scene: &Scene, change: impl FnOnce(&mut Settings)) {
     let error = (&sum - &contracted).amax() / sum.amax().max(1e-2);
     assert!(error < 1e-11, "{} {split:?} {order}: contraction differs by {error:e}", scene.name);
 
-    // Rows of all outputs, columns of all parameters, row by row.
+    // Rows of all outputs, columns of all parameters, row by row. Where there are constraints, configurations change
+    // along curves that keep them.
     let size = states + d.input();
     let mut along = vec![DMatrix::zeros(tensors.len(), size); size];
+    let mut directions = DMatrix::identity(size, size);
+    let turned = |plant: &mut Plant, a: usize, s: f64| {
+        let mut change = vec![0.0; n];
+        change[a] = s;
+        let q = model.retract(&x.q, &change);
+        if d.constraints == 0 {
+            return q;
+        }
+        plant.initialize(&Initial::Projection { q, hold: Vec::new() }).unwrap();
+        plant.q().to_vec()
+    };
+    for a in 0..n {
+        let direction = slope(1e-3, |s| model.difference(&x.q, &turned(&mut plant, a, s)));
+        directions.view_mut((0, a), (n, 1)).copy_from_slice(&direction);
+    }
     for (a, along) in along.iter_mut().enumerate() {
         if (n + d.dynamic..states).contains(&a) {
             continue;
@@ -246,8 +262,7 @@ fn check_second_order_with(scene: &Scene, change: impl FnOnce(&mut Settings)) {
             let (mut x, mut u) = (x.clone(), u.clone());
             let mut change = vec![0.0; n];
             if a < n {
-                change[a] = s;
-                x.q = model.retract(&x.q, &change);
+                x.q = turned(&mut plant, a, s);
             } else if a < states {
                 x.p[a - n] += s;
             } else if a < states + d.inputs {
@@ -273,9 +288,9 @@ fn check_second_order_with(scene: &Scene, change: impl FnOnce(&mut Settings)) {
         *along = DMatrix::from_column_slice(tensors.len(), size, &found);
     }
     for (output, tensor) in tensors.iter().enumerate() {
-        let differences = DMatrix::from_fn(size, size, |a, b| {
-            0.5 * (along[a][(output, b)] + along[b][(output, a)])
-        });
+        let tensor = directions.tr_mul(&(tensor * &directions));
+        let slopes = DMatrix::from_fn(size, size, |a, b| along[a][(output, b)]) * &directions;
+        let differences = (&slopes + slopes.transpose()) * 0.5;
         let scale = differences.amax().max(1e-3);
         for (entry, (x, y)) in tensor.iter().zip(differences.iter()).enumerate() {
             let (a, b) = (entry % size, entry / size);
@@ -299,6 +314,9 @@ fn second_derivatives_on_the_manifold() {
         for order in [4, 8] {
             check_second_order_with(&element(name), |s| s.order = order);
         }
+    }
+    for order in [2, 4, 6] {
+        check_second_order_with(&element("weld"), |s| s.order = order);
     }
 }
 

@@ -400,6 +400,11 @@ pub struct Chart<S = f64> {
 }
 
 impl<S: Scalar> Chart<S> {
+    /// `y`.
+    pub fn vector(&self) -> Vec3<S> {
+        self.y
+    }
+
     /// At `y`.
     #[inline(always)]
     pub fn new(y: Vec3<S>) -> Self {

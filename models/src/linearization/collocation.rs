@@ -21,7 +21,7 @@ use plantd_math::spatial::{Mat3, three};
 
 use crate::integrator::collocation::Collocation;
 use crate::integrator::collocation::closures::Closures;
-use crate::integrator::collocation::slopes::Slopes;
+use crate::integrator::collocation::slopes::{Closing, Slopes};
 use crate::integrator::collocation::system::System;
 use crate::integrator::parameters::Parameters;
 use crate::integrator::report::StepError;
@@ -85,7 +85,8 @@ impl Collocation {
             return Err(StepError::NotFinite { iterations: 0 });
         }
         if let Some(closures) = &mut system.closures {
-            closures.factor(at, &mut system.matrix)?;
+            let closing = system.slopes.as_ref().and_then(|slopes| slopes.closing.as_deref());
+            closures.factor(at, &mut system.matrix, closing)?;
         }
         if system.slopes.is_some() {
             tangents.take(system, at.state);
@@ -94,14 +95,15 @@ impl Collocation {
         }
         let StageTangents { tangent, impulses, slopes, terms, nodes, .. } = &mut *tangents;
         let mut curvature = vec![0.0; if nodes.is_some() { nd * stride } else { 0 }];
-        if let Some(closures) = &system.closures {
+        let closing = system.slopes.as_ref().and_then(|slopes| slopes.closing.as_deref());
+        if let (Some(closures), None) = (&system.closures, closing) {
             closures.add_slopes(&theta, tangent, &mut curvature, slopes);
         }
         system.matrix.solve_rows(tangent, stride);
         out.begin_collocation(h);
         if let (Some(closures), Some(nodes)) = (&mut system.closures, nodes.as_mut()) {
-            closures.close(model, &theta, tangent, &mut nodes.tangent);
-            nodes.take(closures);
+            closures.close(model, &theta, tangent, &mut nodes.tangent, closing);
+            nodes.take(closures, closing);
             let mut lambda = vec![0.0; stride];
             for c in 0..d.constraints {
                 lambda.fill(0.0);
@@ -134,9 +136,19 @@ impl Collocation {
             add_product(&mut moved, tangent, stride, slopes, terms);
             if let Some(nodes) = nodes {
                 moved.iter_mut().zip(&curvature[a * stride..]).for_each(|(m, by)| *m += by);
-                let pulls = nodes.jacobians[..count * d.constraints * n].chunks_exact(n);
+                let impulses = count * d.constraints;
                 terms.clear();
-                terms.extend(pulls.map(|row| -row[a]).zip(0..));
+                match closing {
+                    Some(closing) => {
+                        terms.extend(
+                            closing.next[a * impulses..][..impulses].iter().copied().zip(0..),
+                        );
+                    }
+                    None => {
+                        let pulls = nodes.jacobians[..impulses * n].chunks_exact(n);
+                        terms.extend(pulls.map(|row| -row[a]).zip(0..));
+                    }
+                }
                 add_rows(&mut moved, &nodes.tangent, stride, terms);
             }
             out.set_rows(a, [&increment, &moved]);
@@ -160,11 +172,13 @@ impl NodeTangents {
             tangent: zeros(closures.multipliers.len() * theta.stride),
             responses: zeros(closures.responses.len()),
             schur: closures.schur.clone(),
+            closing: None,
         }
     }
 
     /// Takes the nodes of the solution.
-    fn take(&mut self, closures: &Closures) {
+    fn take(&mut self, closures: &Closures, closing: Option<&Closing>) {
+        self.closing = closing.map(|closing| Box::new(closing.clone()));
         self.q.copy_from_slice(&closures.q);
         let nodes = self.jacobians.chunks_exact_mut(closures.at[0].jacobian.len().max(1));
         nodes.zip(&closures.at).for_each(|(to, at)| to.copy_from_slice(&at.jacobian));

@@ -31,6 +31,7 @@ use plantd_math::pivoted_lu::PivotedLu;
 use plantd_math::rows::{AlignedRows, Term, padded, spread};
 use plantd_math::spatial::{Mat3, Vec3};
 
+use crate::integrator::collocation::slopes::Closing;
 use crate::integrator::parameters::Parameters;
 use crate::integrator::report::StepError;
 use crate::integrator::scheme::Tableau;
@@ -465,4 +466,6 @@ pub(crate) struct NodeTangents {
     /// `J⁻¹ B`, row-major, padded, and the factors of `S`.
     pub(crate) responses: Vec<f64>,
     pub(crate) schur: PivotedLu,
+    /// With ball joints, `B` and `G`.
+    pub(crate) closing: Option<Box<Closing>>,
 }

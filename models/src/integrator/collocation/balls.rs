@@ -16,7 +16,11 @@
 //! p[k+1] = N⁺ Λ + ½ T⁺ T = p + T + Λ × ξ
 //! ```
 //!
-//! with the maps of [`plantd_math::rotation`]. For one stage, `Λ = m`, that is the midpoint rule of
+//! Constraints hold at nodes of their own ([`closures`](super::closures)), where orientations are found as at the
+//! stages, from `η̃_j = Σ_k (κ_jk − ½) Y_k`: `R̃_0 = R[k]` and `R̃_s = R[k+1]`. Their impulses `F̃_j = −Dhᵀ Λ_j`, in the
+//! joint's axes there, count as those of stages: `Dᵀ F̃` in place of `P`, `exp(η̃) F̃` in `T`.
+//!
+//! The maps are those of [`plantd_math::rotation`]. For one stage, `Λ = m`, that is the midpoint rule of
 //! [`balls`](crate::integrator::balls). Other coordinates have `D = exp(η) = N = T⁻ = 1` and `W = 0`: then it is
 //! ordinary collocation.
 //!
@@ -60,6 +64,20 @@ pub(crate) struct Balls {
     torque: Vec<f64>,
     /// `Λ`.
     carried: Vec<Vec3>,
+    pub(crate) nodes: Option<Box<Nodes>>,
+}
+
+/// The ball joints where constraints hold.
+#[derive(Clone, Debug)]
+pub(crate) struct Nodes {
+    /// `κ_jk − ½`, node after node.
+    skew: Vec<f64>,
+    /// Of each node, joint after joint.
+    charts: Vec<Chart>,
+    /// At the node that was moved to last.
+    orientations: Vec<Mat3>,
+    /// `Σ exp(η̃) F̃`.
+    torque: Vec<Vec3>,
 }
 
 /// The numbers of the three coordinates of a joint, of four stages.
@@ -106,6 +124,14 @@ impl Balls {
             rates: vec![Vec3::ZERO; stages],
             torque: vec![0.0; 3 * no * width],
             carried: vec![Vec3::ZERO; no],
+            nodes: (model.dimensions.constraints > 0).then(|| {
+                Box::new(Nodes {
+                    skew: tableau.reach.iter().map(|kappa| kappa - 0.5).collect(),
+                    charts: vec![Chart::new(Vec3::ZERO); no * tableau.ends.len()],
+                    orientations: vec![Mat3::IDENTITY; no],
+                    torque: vec![Vec3::ZERO; no],
+                })
+            }),
             coordinates,
         }
     }
@@ -158,8 +184,54 @@ impl Balls {
         &self.orientations[g * no..][..no]
     }
 
+    /// Orientations at the start, and half-way.
+    pub(super) fn start(&self) -> &[Mat3] {
+        &self.start
+    }
+
+    pub(super) fn centers(&self) -> &[Mat3] {
+        &self.centers
+    }
+
+    /// Moves to a node of the constraints, where the orientations are returned.
+    pub(super) fn move_to_node(&mut self, increment: &[f64], j: usize) -> &[Mat3] {
+        let Self { nodes: Some(nodes), coordinates, centers, count, width, .. } = self else {
+            return &[];
+        };
+        let skew = &nodes.skew[j * *count..][..*count];
+        let own = nodes.charts[j * coordinates.len()..].iter_mut().zip(&mut nodes.orientations);
+        for ((c, center), (chart, orientation)) in coordinates.iter().zip(centers).zip(own) {
+            *chart = Chart::new(Vec3([0, 1, 2].map(|a| {
+                let numbers = &increment[(c + a) * *width..][..*count];
+                skew.iter().zip(numbers).map(|(s, y)| s * y).sum()
+            })));
+            *orientation = center.times(&chart.exp());
+        }
+        &nodes.orientations
+    }
+
+    /// Takes the impulses of constraints at a node, in the charts from now on.
+    pub(super) fn take_pushes(&mut self, j: usize, pushes: &mut [f64]) {
+        let Some(nodes) = &mut self.nodes else { return };
+        let own = nodes.charts[j * self.coordinates.len()..].iter().zip(&mut nodes.torque);
+        for (&c, (chart, torque)) in self.coordinates.iter().zip(own) {
+            let push = three(pushes, c);
+            *torque += chart.exp().apply(push);
+            pushes[c..c + 3].copy_from_slice(&chart.dexp().apply_transposed(push).0);
+        }
+    }
+
+    /// `η̃` of a joint at a node.
+    pub(super) fn at_node(&self, o: usize, j: usize) -> Vec3 {
+        let chart = |nodes: &Nodes| nodes.charts[j * self.coordinates.len() + o].vector();
+        self.nodes.as_deref().map_or(Vec3::ZERO, chart)
+    }
+
     /// Finds where the joints are half-way.
     pub(super) fn turn(&mut self, increment: &[f64]) {
+        if let Some(nodes) = &mut self.nodes {
+            nodes.torque.fill(Vec3::ZERO);
+        }
         for (o, &c) in self.coordinates.iter().enumerate() {
             let sum = |a: usize| increment[(c + a) * self.width..][..self.count].iter().sum();
             self.turns[o] = Turn::new(Vec3([sum(0), sum(1), sum(2)]));
@@ -216,7 +288,8 @@ impl Balls {
     /// `ΣT` of a joint.
     fn total(&self, o: usize) -> Vec3 {
         let sum = |a: usize| self.torque[(3 * o + a) * self.width..][..self.count].iter().sum();
-        Vec3([sum(0), sum(1), sum(2)])
+        let of_stages = Vec3([sum(0), sum(1), sum(2)]);
+        self.nodes.as_deref().map_or(of_stages, |nodes| of_stages + nodes.torque[o])
     }
 
     /// Writes the residuals of ball joints.

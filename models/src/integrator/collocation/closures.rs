@@ -10,16 +10,19 @@
 //! 0 = h(Q̃_j)   j = 1 … s          p[k+1] = p + Σ P_j − Σ_j<s Dh(Q̃_j)ᵀ Λ_j          λ = Σ Λ_j
 //! ```
 //!
-//! These are the equations of the discrete action `Σ h b_i L(Q_i, V_i) − Σ_j<s Λ_j·h(Q̃_j)`: the method is
-//! symplectic, and keeps momenta. Of `J = ∂R/∂Y`, `B = ∂R/∂Λ` and `G = ∂h/∂Y` corrections take the inverse of
+//! which [`balls`](super::balls) has for ball joints. These are the equations of the discrete action
+//! `Σ h b_i L(Q_i, V_i) − Σ_j<s Λ_j·h(Q̃_j)`: the method is symplectic, and keeps momenta. Of `J = ∂R/∂Y`, `B = ∂R/∂Λ` and `G = ∂h/∂Y` corrections take the inverse of
 //! `J` and the factors of `S = G J⁻¹ B`, whose dependent rows are treated as those of the midpoint rule.
 
 use plantd_math::dense_inverse::DenseInverse;
 use plantd_math::norms::larger;
 use plantd_math::pivoted_lu::PivotedLu;
 use plantd_math::rows::{Term, add_rows, padded};
+use plantd_math::spatial::Mat3;
 
 use crate::constraints::closure::Closure;
+use crate::integrator::collocation::balls::Balls;
+use crate::integrator::collocation::slopes::{Closing, Slopes};
 use crate::integrator::parameters::Parameters;
 use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::scheme::Tableau;
@@ -43,8 +46,10 @@ pub(crate) struct Closures {
     pub(crate) multipliers: Vec<f64>,
     /// `Σ_c Λ_jc D²h_c` at all nodes but the end, square.
     hessians: Vec<f64>,
-    /// `−Dhᵀ Λ_j`.
+    /// `−Dhᵀ Λ_j`, of ball joints in their charts.
     pushes: Vec<f64>,
+    /// What stages have of the pushes at the start: 1, and of ball joints, which have half of them at the centre, ½.
+    whole: Vec<f64>,
     /// Right-hand side, then the last `−ΔΛ`.
     correction: Vec<f64>,
     /// What the last correction of the increments makes of `−Σ Dhᵀ Λ`, which was evaluated before it.
@@ -67,8 +72,13 @@ impl Closures {
         let (count, nc, nd, n) = (tableau.nodes.len(), d.constraints, d.dynamic, d.coordinates());
         let zeros = |len: usize| vec![0.0; len];
         let stride = padded(count * nc);
+        let mut whole = vec![1.0; nd];
+        for &c in model.orientations.iter().filter(|c| **c < nd) {
+            whole[c..c + 3].fill(0.5);
+        }
         Self {
             count,
+            whole,
             nodes: tableau.ends.clone(),
             reach: tableau.reach.clone(),
             shares: tableau.shares.clone(),
@@ -109,8 +119,12 @@ impl Closures {
         &self.hessians[j * size..][..size]
     }
 
-    /// Takes the start, prescribed positions, and the last impulses for a guess.
-    pub(super) fn begin(&mut self, StepContext { model, state, u, .. }: StepContext<'_>) {
+    /// Takes the start, with the orientations of ball joints, prescribed positions, and the last impulses for a guess.
+    pub(super) fn begin(
+        &mut self,
+        StepContext { model, state, u, .. }: StepContext<'_>,
+        orientations: &[Mat3],
+    ) {
         let d = model.dimensions;
         let (nd, n) = (d.dynamic, d.coordinates());
         for (node, q) in self.nodes.iter().zip(self.q.chunks_exact_mut(n)) {
@@ -121,7 +135,7 @@ impl Closures {
         }
         self.q[..nd].copy_from_slice(&state.q[..nd]);
         let [start, others @ ..] = &mut self.at[..] else { return };
-        start.evaluate(model, &self.q[..n], &[]);
+        start.evaluate(model, &self.q[..n], orientations);
         start.differentiate(model, &self.q[..n]);
         others.iter_mut().for_each(|node| node.expect_round_off_of(start));
         self.turned.fill(0.0);
@@ -139,6 +153,7 @@ impl Closures {
         StepContext { model, state, .. }: StepContext<'_>,
         increments: &[f64],
         width: usize,
+        mut balls: Option<&mut Balls>,
     ) -> f64 {
         let d = model.dimensions;
         let (nd, n, count) = (d.dynamic, d.coordinates(), self.count);
@@ -149,7 +164,9 @@ impl Closures {
                 let moved: f64 = own.iter().zip(reach).map(|(y, kappa)| y * kappa).sum();
                 q[a] = state.q[a] + (state.q_low[a] + moved);
             }
-            self.at[j].evaluate(model, q, &[]);
+            let orientations =
+                balls.as_mut().map_or(&[][..], |balls| balls.move_to_node(increments, j));
+            self.at[j].evaluate(model, q, orientations);
             if j < count {
                 self.at[j].differentiate(model, q);
             }
@@ -170,6 +187,12 @@ impl Closures {
             }
             largest = sizes.iter().copied().fold(largest, larger);
         }
+        if let Some(balls) = balls {
+            balls.move_to_node(increments, 0);
+            for (j, pushes) in self.pushes.chunks_exact_mut(nd.max(1)).enumerate() {
+                balls.take_pushes(j, pushes);
+            }
+        }
         largest
     }
 
@@ -182,23 +205,45 @@ impl Closures {
     pub(super) fn add_pushes(&self, residual: &mut [f64]) {
         let count = self.count;
         let nd = self.pushes.len() / count;
-        for (a, residual) in residual.chunks_exact_mut(count).enumerate() {
+        let rows = residual.chunks_exact_mut(count).zip(&self.whole);
+        for (a, (residual, whole)) in rows.enumerate() {
             for (pushes, reach) in
                 self.pushes.chunks_exact(nd.max(1)).zip(self.reach.chunks_exact(count))
             {
                 let stages = residual.iter_mut().zip(reach);
-                stages.for_each(|(r, kappa)| *r += (1.0 - kappa) * pushes[a]);
+                stages.for_each(|(r, kappa)| *r += (whole - kappa) * pushes[a]);
             }
         }
     }
 
-    /// Second derivatives at the last evaluation; of the start too, where derivatives by it are asked for.
+    /// Second derivatives at the last evaluation, of the start too where derivatives by it are asked for, and the
+    /// Jacobian at the end.
     pub(crate) fn curve(&mut self, model: &Model, with_start: bool) {
         let n = model.dimensions.coordinates();
+        self.at[self.count].differentiate(model, &self.q[self.count * n..]);
         let nc = self.equations();
         for j in usize::from(!with_start)..self.count {
             let (q, lambda) = (&self.q[j * n..][..n], &self.multipliers[j * nc..][..nc]);
             self.at[j].hessian(model, q, lambda, &mut self.hessians[j * n * n..][..n * n]);
+        }
+    }
+
+    /// Hands out what is known of the nodes.
+    pub(super) fn place(&self, model: &Model, slopes: &mut Slopes) {
+        let (nd, n, count) = (model.dimensions.dynamic, model.dimensions.coordinates(), self.count);
+        let nc = self.equations();
+        for (j, at) in self.at.iter().enumerate() {
+            if let Some(closing) = &mut slopes.closing {
+                closing.jacobians[j * nc * n..][..nc * n].copy_from_slice(&at.jacobian);
+            }
+            if j == count {
+                continue;
+            }
+            let curvature = slopes.second[0][(count + j) * nd * n..].iter_mut();
+            curvature.zip(&self.hessian(j)[..nd * n]).for_each(|(to, from)| *to = -from);
+            let push = &mut slopes.torque[(count + j) * nd..][..nd];
+            push.fill(0.0);
+            at.subtract_impulses(model, &self.multipliers[j * nc..][..nc], push);
         }
     }
 
@@ -221,7 +266,7 @@ impl Closures {
         }
     }
 
-    /// Factors `S`, at the last evaluation and with the inverse of `J`.
+    /// Factors `S`, at the last evaluation and with the inverse of `J`; with ball joints `closing` has `B` and `G`.
     ///
     /// # Errors
     ///
@@ -230,11 +275,38 @@ impl Closures {
         &mut self,
         at: StepContext<'_>,
         matrix: &mut DenseInverse,
+        closing: Option<&Closing>,
     ) -> Result<(), StepError> {
         let StepContext { model, settings, .. } = at;
+        let (count, nc, stride) = (self.count, self.equations(), self.stride());
+        match closing {
+            None => self.fill_columns(model),
+            Some(Closing { residual, .. }) => {
+                let rows = residual.chunks_exact(count * nc);
+                for (to, from) in self.responses.chunks_exact_mut(stride).zip(rows) {
+                    to[..count * nc].copy_from_slice(from);
+                }
+            }
+        }
+        matrix.solve_rows(&mut self.responses, stride);
+        self.fill_schur(model, closing);
+        self.schur.factor();
+        let rank = count * model.constraint_rank();
+        let estimate = self.schur.reciprocal_condition(rank, settings.time_step_s.abs());
+        self.estimate = estimate;
+        if estimate < settings.singular_below {
+            self.fill_schur(model, closing);
+            let last = self.schur.matrix.chunks_exact(count * nc).skip((count - 1) * nc);
+            let block: Vec<f64> = last.flat_map(|row| &row[(count - 1) * nc..]).copied().collect();
+            return Err(model.singular_constraints(&block, estimate));
+        }
+        Ok(())
+    }
+
+    /// Writes `B` in place of the responses.
+    fn fill_columns(&mut self, model: &Model) {
         let n = model.dimensions.coordinates();
         let (count, nc, stride) = (self.count, self.equations(), self.stride());
-        self.at[count].differentiate(model, &self.q[count * n..]);
         self.responses.fill(0.0);
         for (j, at) in self.at[..count].iter().enumerate() {
             let reach = &self.reach[j * count..][..count];
@@ -248,19 +320,6 @@ impl Closures {
                 }
             }
         }
-        matrix.solve_rows(&mut self.responses, stride);
-        self.fill_schur(model);
-        self.schur.factor();
-        let rank = count * model.constraint_rank();
-        let estimate = self.schur.reciprocal_condition(rank, settings.time_step_s.abs());
-        self.estimate = estimate;
-        if estimate < settings.singular_below {
-            self.fill_schur(model);
-            let last = self.schur.matrix.chunks_exact(count * nc).skip((count - 1) * nc);
-            let block: Vec<f64> = last.flat_map(|row| &row[(count - 1) * nc..]).copied().collect();
-            return Err(model.singular_constraints(&block, estimate));
-        }
-        Ok(())
     }
 
     pub(super) fn write(&self, report: &mut StepReport) {
@@ -268,9 +327,21 @@ impl Closures {
         report.redundant_constraints = (self.schur.deficiency() / self.count) as u32;
     }
 
-    fn fill_schur(&mut self, model: &Model) {
+    fn fill_schur(&mut self, model: &Model, closing: Option<&Closing>) {
         let n = model.dimensions.coordinates();
         let (count, nc, stride) = (self.count, self.equations(), self.stride());
+        if let Some(Closing { equations: [by_y, _], .. }) = closing {
+            let Self { responses, moved, schur, terms, .. } = self;
+            let rows = schur.matrix.chunks_exact_mut(count * nc);
+            for (row, by_y) in rows.zip(by_y.chunks_exact(responses.len() / stride)) {
+                moved[..stride].fill(0.0);
+                terms.clear();
+                terms.extend(by_y.iter().copied().zip(0..));
+                add_rows(&mut moved[..stride], responses, stride, terms);
+                row.copy_from_slice(&moved[..count * nc]);
+            }
+            return;
+        }
         for j in 1..=count {
             let Self { reach, responses, moved, schur, terms, at, .. } = &mut *self;
             let reach = &reach[j * count..][..count];
@@ -293,10 +364,37 @@ impl Closures {
     }
 
     /// From the residuals of the stages to the change `−ΔY`, and on to the next impulses.
-    pub(super) fn solve(&mut self, model: &Model, matrix: &mut DenseInverse, x: &mut [f64]) {
-        let n = model.dimensions.coordinates();
-        let (count, nc, stride) = (self.count, self.equations(), self.stride());
+    pub(super) fn solve(
+        &mut self,
+        model: &Model,
+        matrix: &mut DenseInverse,
+        x: &mut [f64],
+        closing: Option<&Closing>,
+    ) {
+        let stride = self.stride();
         matrix.solve(x);
+        match closing {
+            None => self.find_gaps(model, x),
+            Some(Closing { equations: [by_y, _], .. }) => {
+                let values = self.at[1..].iter().flat_map(|at| &at.value);
+                let rows = by_y.chunks_exact(x.len()).zip(values);
+                for (gap, (row, value)) in self.correction.iter_mut().zip(rows) {
+                    *gap = row.iter().zip(&*x).map(|(entry, x)| entry * x).sum::<f64>() - value;
+                }
+            }
+        }
+        self.schur.solve(&mut self.correction);
+        for (x, row) in x.iter_mut().zip(self.responses.chunks_exact(stride)) {
+            *x -= row.iter().zip(&self.correction).map(|(r, c)| r * c).sum::<f64>();
+        }
+        let pairs = self.multipliers.iter_mut().zip(&self.correction);
+        pairs.for_each(|(lambda, change)| *lambda -= change);
+    }
+
+    /// `G x − h`.
+    fn find_gaps(&mut self, model: &Model, x: &[f64]) {
+        let n = model.dimensions.coordinates();
+        let (count, nc) = (self.count, self.equations());
         for j in 1..=count {
             let reach = &self.reach[j * count..][..count];
             for (moved, x) in self.moved.iter_mut().zip(x.chunks_exact(count)) {
@@ -309,12 +407,6 @@ impl Closures {
                 self.correction[(j - 1) * nc + c] = along - at.value[c];
             }
         }
-        self.schur.solve(&mut self.correction);
-        for (x, row) in x.iter_mut().zip(self.responses.chunks_exact(stride)) {
-            *x -= row.iter().zip(&self.correction).map(|(r, c)| r * c).sum::<f64>();
-        }
-        let pairs = self.multipliers.iter_mut().zip(&self.correction);
-        pairs.for_each(|(lambda, change)| *lambda -= change);
     }
 
     /// Adds to the derivatives of the residuals, of `Σ P` and of its slopes by the parameters `(q, p, u, k)` and by
@@ -355,10 +447,44 @@ impl Closures {
         theta: &Parameters,
         tangent: &mut [f64],
         multipliers: &mut [f64],
+        closing: Option<&Closing>,
     ) {
         let &Parameters { nc, stride, .. } = theta;
-        let (n, count, width) = (theta.n(), self.count, self.stride());
-        let Self { reach, nodes, at, responses, schur, terms, .. } = self;
+        let (count, width) = (self.count, self.stride());
+        match closing {
+            None => self.write_equations(model, theta, tangent, multipliers),
+            Some(Closing { equations: [by_y, by_theta], .. }) => {
+                multipliers.copy_from_slice(by_theta);
+                let rows = by_y.chunks_exact(tangent.len() / stride);
+                for (row, by_y) in multipliers.chunks_exact_mut(stride).zip(rows) {
+                    self.terms.clear();
+                    self.terms.extend(by_y.iter().map(|entry| -entry).zip(0..));
+                    add_rows(row, tangent, stride, &self.terms);
+                }
+            }
+        }
+        let Self { responses, schur, terms, .. } = self;
+        schur.reserve(stride);
+        schur.solve_rows(multipliers, stride);
+        for (row, responses) in tangent.chunks_exact_mut(stride).zip(responses.chunks_exact(width))
+        {
+            terms.clear();
+            terms.extend(responses[..count * nc].iter().copied().zip(0..));
+            add_rows(row, multipliers, stride, terms);
+        }
+    }
+
+    /// Writes `h_θ − G J⁻¹ R_θ`.
+    fn write_equations(
+        &mut self,
+        model: &Model,
+        theta: &Parameters,
+        tangent: &[f64],
+        multipliers: &mut [f64],
+    ) {
+        let &Parameters { nc, stride, .. } = theta;
+        let (n, count) = (theta.n(), self.count);
+        let Self { reach, nodes, at, terms, .. } = self;
         multipliers.fill(0.0);
         for (row, (j, c)) in multipliers
             .chunks_exact_mut(stride)
@@ -377,14 +503,6 @@ impl Closures {
                 terms.extend(stages.map(|(k, kappa)| (-kappa * jacobian[a], a * count + k)));
             }
             add_rows(row, tangent, stride, terms);
-        }
-        schur.reserve(stride);
-        schur.solve_rows(multipliers, stride);
-        for (row, responses) in tangent.chunks_exact_mut(stride).zip(responses.chunks_exact(width))
-        {
-            terms.clear();
-            terms.extend(responses[..count * nc].iter().copied().zip(0..));
-            add_rows(row, multipliers, stride, terms);
         }
     }
 

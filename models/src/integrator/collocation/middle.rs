@@ -12,7 +12,10 @@
 //! One factorization serves all stages and rounds, and costs O(n) where that of the midpoint rule does.
 
 use plantd_math::dense_inverse::DenseInverse;
+use plantd_math::rotation::Turn;
+use plantd_math::spatial::Vec3;
 
+use crate::integrator::collocation::balls::Balls;
 use crate::integrator::collocation::closures::Closures;
 use crate::integrator::collocation::secants::Secants;
 use crate::integrator::scheme::Tableau;
@@ -80,25 +83,33 @@ impl Middle {
     }
 
     /// Factors at the middle of the increments `Y`, numbers of a coordinate `width` apart; false if that is singular.
+    /// Ball joints are where they are half-way, and changes of theirs by the axes that they have there.
     pub(super) fn factor(
         &mut self,
         workspace: &mut Workspace,
         at: StepContext<'_>,
-        increments: &[f64],
-        width: usize,
+        (increments, width): (&[f64], usize),
+        balls: Option<&Balls>,
     ) -> bool {
         let StepContext { model, settings, state, .. } = at;
         self.weigh(model, settings.time_step_s.abs());
         workspace.prepare(at);
-        let Workspace { step, mid, constraints, .. } = workspace;
+        let Workspace { step, mid, constraints, balls: turning, .. } = workspace;
         for (x, own) in step.increment.iter_mut().zip(increments.chunks_exact(width)) {
             *x = own.iter().sum();
         }
         mid.go_to(state, &step.increment, 1.0 / settings.time_step_s);
+        if let Some(balls) = balls {
+            mid.orientations.copy_from_slice(balls.centers());
+            turning.turns.fill(Turn::new(Vec3::ZERO));
+            for &c in &balls.coordinates {
+                step.increment[c..c + 3].fill(0.0);
+            }
+        }
         mid.evaluate(model);
         step.q_end.copy_from_slice(&mid.q);
-        constraints.start.complete(model, &mid.q, &[]);
-        constraints.end.evaluate(model, &mid.q, &[]);
+        constraints.start.complete(model, &mid.q, &mid.orientations);
+        constraints.end.evaluate(model, &mid.q, &mid.orientations);
         constraints.forget();
         workspace.factor(model, settings, state).is_ok()
     }

@@ -10,7 +10,8 @@
 //! ```
 //!
 //! where `D`, `W` and `exp(η)` of the joint itself change too. Of other coordinates `D = exp(η) = 1`, `W = 0`,
-//! and the centre is the middle of the step.
+//! and the centre is the middle of the step. Nodes where constraints hold are places like the stages, where impulses
+//! act and nothing moves; with them come derivatives by these impulses, and of the equations.
 //!
 //! Second derivatives of the step are the dual parts of all that.
 
@@ -24,21 +25,26 @@ use crate::model::mechanism::Model;
 
 /// The stages, and what they make of the step.
 ///
-/// Tables of stages have `nd` rows for each; all are row-major. Unknowns and residuals are those of the stages
+/// Tables of places have `nd` rows for each; all are row-major. Unknowns and residuals are those of the stages
 /// of a coordinate side by side.
 #[derive(Clone, Debug)]
 pub(crate) struct Slopes<S = f64> {
     count: usize,
+    /// Where something acts: the stages, and the nodes of constraints but the last.
+    places: usize,
+    /// Of these and of the last node, by which part of each `Y` it is from the centre: `σ_ik`, and `κ_jk − ½`.
+    skew: Vec<f64>,
+    pub(crate) closing: Option<Box<Closing<S>>>,
     pub(crate) theta: Parameters,
     /// First coordinates of the ball joints.
     balls: Vec<usize>,
     pub(crate) tableau: Tableau,
     pub(crate) time_step_s: f64,
-    /// At the stages: `L_qq + f_q`, `L_qv + f_v`, `L_vq`, `L_vv`, n columns; then by `η` and `V`.
+    /// At the places: `L_qq + f_q`, `L_qv + f_v`, `L_vq`, `L_vv`, n columns; then by `η` and `V`.
     pub(crate) second: [Vec<S>; 4],
     /// `f_u`, ni columns; then of `F`.
     pub(crate) by_input: Vec<S>,
-    /// At the stages: `η` and `V` of ball joints, `L_q + f` and `L_v`.
+    /// At the places: `η`, of the last node too, and `V` of ball joints, `L_q + f` and `L_v`.
     pub(crate) offset: Vec<S>,
     pub(crate) rate: Vec<S>,
     pub(crate) torque: Vec<S>,
@@ -61,6 +67,19 @@ pub(crate) struct Slopes<S = f64> {
     pub(crate) next_by: [Vec<S>; 2],
 }
 
+/// Derivatives by the impulses of constraints at the nodes but the last, node after node, and of the equations at the
+/// nodes but the first.
+#[derive(Clone, Debug)]
+pub(crate) struct Closing<S = f64> {
+    /// `Dh` at all nodes, n columns.
+    pub(crate) jacobians: Vec<S>,
+    /// Of the residuals, and of the next momentum, by the impulses.
+    pub(crate) residual: Vec<S>,
+    pub(crate) next: Vec<S>,
+    /// Of the equations, by `Y` and by the parameters.
+    pub(crate) equations: [Vec<S>; 2],
+}
+
 fn put<S: Scalar>(row: &mut [S], at: usize, v: Vec3<S>) {
     row[at..at + 3].copy_from_slice(&v.0);
 }
@@ -81,17 +100,34 @@ impl<S: Scalar> Slopes<S> {
         let theta = Parameters::new(model);
         let (nd, n, ni, count) = (theta.nd, theta.n(), theta.ni, tableau.nodes.len());
         let zeros = |len: usize| vec![S::ZERO; len];
-        let table = |columns: usize| zeros(count * nd * columns);
+        let nodes = if theta.nc > 0 { count } else { 0 };
+        let places = count + nodes;
+        let mut skew = tableau.skew.clone();
+        if nodes > 0 {
+            skew.extend(tableau.reach.iter().map(|kappa| kappa - 0.5));
+        }
+        let impulses = nodes * theta.nc;
+        let table = |columns: usize| zeros(places * nd * columns);
         let by = |rows: usize| [zeros(rows * nd * count), zeros(rows * theta.stride)];
         Self {
             count,
+            places,
+            closing: (nodes > 0).then(|| {
+                Box::new(Closing {
+                    jacobians: zeros((nodes + 1) * theta.nc * n),
+                    residual: zeros(count * nd * impulses),
+                    next: zeros(nd * impulses),
+                    equations: [zeros(impulses * count * nd), zeros(impulses * theta.stride)],
+                })
+            }),
+            offset: zeros(skew.len() / count * nd),
+            skew,
             theta,
             balls: model.orientations.iter().copied().filter(|i| *i < nd).collect(),
             tableau: tableau.clone(),
             time_step_s: 0.0,
             second: [table(n), table(n), table(n), table(n)],
             by_input: table(ni),
-            offset: table(1),
             rate: table(1),
             torque: table(1),
             momentum: table(1),
@@ -112,23 +148,27 @@ impl<S: Scalar> Slopes<S> {
     /// Finds all derivatives.
     pub(crate) fn find(&mut self) {
         self.total.fill(S::ZERO);
-        for stage in 0..self.count {
-            self.turn_stage(stage);
+        for place in 0..self.places {
+            self.turn_place(place);
         }
         self.find_center();
         self.find_residuals();
         self.find_next();
+        self.close();
     }
 
-    fn length(&self, stage: usize) -> f64 {
-        self.time_step_s * self.tableau.weights[stage]
+    /// How long it acts at each place, if that is what acts there, and how far each is in the step.
+    fn lengths(&self) -> Vec<[f64; 2]> {
+        let Tableau { nodes, weights, ends, .. } = &self.tableau;
+        let stages = weights.iter().zip(nodes).map(|(b, c)| [self.time_step_s * b, *c]);
+        stages.chain(ends.iter().map(|c| [1.0, *c])).take(self.places).collect()
     }
 
-    /// Derivatives at a stage by `η`, `V` and the centre.
-    fn turn_stage(&mut self, stage: usize) {
+    /// Derivatives at a place by `η`, `V` and the centre.
+    fn turn_place(&mut self, place: usize) {
         let (nd, n, ni) = (self.theta.nd, self.theta.n(), self.theta.ni);
-        let length = self.length(stage);
-        let own = stage * nd..(stage + 1) * nd;
+        let length = self.lengths()[place][0];
+        let own = place * nd..(place + 1) * nd;
         let of = |columns: usize| own.start * columns..own.end * columns;
         let [qq, qv, vq, vv] = self.second.each_mut().map(|table| &mut table[of(n)]);
         let [fc, mc] = self.by_center.each_mut().map(|table| &mut table[of(n)]);
@@ -201,18 +241,16 @@ impl<S: Scalar> Slopes<S> {
     fn find_center(&mut self) {
         let (nd, n, ni, stride) = (self.theta.nd, self.theta.n(), self.theta.ni, self.theta.stride);
         let (inputs, next, count) = (self.theta.inputs(), self.theta.next(), self.count);
-        let (h, skew) = (self.time_step_s, &self.tableau.skew);
+        let (h, skew, lengths) = (self.time_step_s, &self.skew, self.lengths());
         // How the centre turns with the increment, and with the start.
         let turns: Vec<(usize, Turn<S>)> =
             self.balls.iter().map(|&c| (c, Turn::new(three(&self.increment, c)))).collect();
         let [total_y, total_theta] = &mut self.total_by;
         total_y.fill(S::ZERO);
         total_theta.fill(S::ZERO);
-        for stage in 0..count {
-            let length = h * self.tableau.weights[stage];
-            let node = self.tableau.nodes[stage];
+        for (place, [length, node]) in lengths.into_iter().enumerate() {
             for a in 0..nd {
-                let at = (stage * nd + a) * n;
+                let at = (place * nd + a) * n;
                 let by_y = &mut total_y[a * nd * count..][..nd * count];
                 let by_theta = &mut total_theta[a * stride..][..stride];
                 let [tq, tv, tc] = self.torques.each_ref().map(|table| &table[at..][..n]);
@@ -222,9 +260,11 @@ impl<S: Scalar> Slopes<S> {
                         by_theta[b] += tc[b] * length;
                         let by_y = &mut by_y[b * count..][..count];
                         for (k, entry) in by_y.iter_mut().enumerate() {
-                            *entry += by_offset * skew[stage * count + k];
+                            *entry += by_offset * skew[place * count + k];
                         }
-                        by_y[stage] += tv[b];
+                        if place < count {
+                            by_y[place] += tv[b];
+                        }
                     } else {
                         let by_rate = tv[b] * (length / h);
                         by_theta[b] += by_offset * (1.0 - node) - by_rate;
@@ -233,7 +273,7 @@ impl<S: Scalar> Slopes<S> {
                 }
                 for u in 0..ni {
                     by_theta[inputs + u] +=
-                        self.torque_by_input[(stage * nd + a) * ni + u] * length;
+                        self.torque_by_input[(place * nd + a) * ni + u] * length;
                 }
             }
         }
@@ -300,7 +340,7 @@ impl<S: Scalar> Slopes<S> {
     fn find_residuals(&mut self) {
         let (nd, n, ni, stride) = (self.theta.nd, self.theta.n(), self.theta.ni, self.theta.stride);
         let (inputs, next, count) = (self.theta.inputs(), self.theta.next(), self.count);
-        let Tableau { nodes, weights, skew, .. } = &self.tableau;
+        let (skew, lengths, places) = (&self.skew, self.lengths(), self.places);
         let h = self.time_step_s;
         let [residual_y, residual_theta] = &mut self.residual;
         let [center_y, center_theta] = &self.center_by;
@@ -318,7 +358,7 @@ impl<S: Scalar> Slopes<S> {
                 put(out, *c, map.apply_transposed(three(row, *c)));
             }
         };
-        let mut moved = vec![S::ZERO; count * nd];
+        let mut moved = vec![S::ZERO; places * nd];
         let mut carried = vec![S::ZERO; nd];
         for a in 0..nd {
             for j in 0..count {
@@ -328,7 +368,7 @@ impl<S: Scalar> Slopes<S> {
                 residual_theta[row * stride..][..stride]
                     .copy_from_slice(&center_theta[a * stride..][..stride]);
             }
-            for i in 0..count {
+            for i in 0..places {
                 let at = (i * nd + a) * n;
                 half(&self.by_center[0][at..][..nd], &mut moved[i * nd..][..nd]);
             }
@@ -338,10 +378,10 @@ impl<S: Scalar> Slopes<S> {
                 let by_theta = &mut residual_theta[row * stride..][..stride];
                 let own = (j * nd + a) * n;
                 half(&self.by_center[1][own..][..nd], &mut carried);
-                for i in 0..count {
+                for (i, [length, node]) in lengths.iter().enumerate() {
                     let at = (i * nd + a) * n;
-                    let length = h * weights[i];
-                    let weight = skew[j * count + i] * length;
+                    let part = -skew[i * count + j];
+                    let weight = part * length;
                     let [qq, qv, ..] = self.second.each_ref().map(|table| &table[at..][..n]);
                     for b in 0..n {
                         let by_offset = qq[b] * weight;
@@ -352,11 +392,13 @@ impl<S: Scalar> Slopes<S> {
                             for (k, entry) in entries.iter_mut().enumerate() {
                                 *entry += by_offset * skew[i * count + k] + through;
                             }
-                            entries[i] += qv[b] * skew[j * count + i];
+                            if i < count {
+                                entries[i] += qv[b] * part;
+                            }
                         } else {
                             let by_rate = qv[b] * (weight / h);
-                            by_theta[b] += by_offset * (1.0 - nodes[i]) - by_rate;
-                            by_theta[next + b - nd] += by_offset * nodes[i] + by_rate;
+                            by_theta[b] += by_offset * (1.0 - node) - by_rate;
+                            by_theta[next + b - nd] += by_offset * *node + by_rate;
                         }
                     }
                     for u in 0..ni {
@@ -364,6 +406,7 @@ impl<S: Scalar> Slopes<S> {
                     }
                 }
                 let [.., vq, vv] = self.second.each_ref().map(|table| &table[own..][..n]);
+                let [length, node] = lengths[j];
                 for b in 0..n {
                     if b < nd {
                         by_theta[b] -= self.by_center[1][own + b];
@@ -371,11 +414,11 @@ impl<S: Scalar> Slopes<S> {
                         for (k, entry) in entries.iter_mut().enumerate() {
                             *entry -= vq[b] * skew[j * count + k] + carried[b];
                         }
-                        entries[j] -= vv[b] * (1.0 / (h * weights[j]));
+                        entries[j] -= vv[b] * (1.0 / length);
                     } else {
                         let by_rate = vv[b] * (1.0 / h);
-                        by_theta[b] -= vq[b] * (1.0 - nodes[j]) - by_rate;
-                        by_theta[next + b - nd] -= vq[b] * nodes[j] + by_rate;
+                        by_theta[b] -= vq[b] * (1.0 - node) - by_rate;
+                        by_theta[next + b - nd] -= vq[b] * node + by_rate;
                     }
                 }
             }
@@ -412,6 +455,77 @@ impl<S: Scalar> Slopes<S> {
                     let sum = column(&self.next_by[0], c, nd * count, at) + turned;
                     put_column(&mut self.next_by[0], c, nd * count, at, sum);
                 }
+            }
+        }
+    }
+
+    /// Derivatives by the impulses of constraints, and of the equations.
+    fn close(&mut self) {
+        let Self { closing: Some(closing), theta, count, skew, balls, tableau, .. } = self else {
+            return;
+        };
+        let (nd, n, nc, stride, count) = (theta.nd, theta.n(), theta.nc, theta.stride, *count);
+        let (columns, unknowns) = (nc * count, nd * count);
+        let Closing { jacobians, residual, next, equations: [by_y, by_theta] } = &mut **closing;
+        let turns: Vec<(usize, Turn<S>, Mat3<S>)> = (balls.iter())
+            .map(|&c| {
+                let turn = Turn::new(three(&self.increment, c));
+                let to_center = Chart::new(turn.xi).dexp().times(&turn.torque_at_start());
+                (c, turn, to_center)
+            })
+            .collect();
+        by_theta.fill(S::ZERO);
+        let mut center = vec![S::ZERO; nd];
+        for (at, gradient) in jacobians.chunks_exact(n).enumerate() {
+            let j = at / nc;
+            let part = &skew[(count + j) * count..][..count];
+            let offset = &self.offset[(count + j) * nd..][..nd];
+            let chart = |c: usize| Chart::new(three(offset, c));
+            if j < count {
+                let mut push = |a: usize, [total, center, own]: [S; 3]| {
+                    next[a * columns + at] = total;
+                    for (k, part) in part.iter().enumerate() {
+                        residual[(a * count + k) * columns + at] = center - own * *part;
+                    }
+                };
+                for (a, entry) in gradient[..nd].iter().enumerate() {
+                    push(a, [-*entry, *entry * -0.5, -*entry]);
+                }
+                for (c, turn, to_center) in &turns {
+                    let (chart, force) = (chart(*c), -three(gradient, *c));
+                    let (total, own) =
+                        (chart.exp().apply(force), chart.dexp().apply_transposed(force));
+                    let center = to_center.apply(total.scaled(0.5));
+                    let total = total + center.cross(turn.xi);
+                    (0..3).for_each(|a| push(c + a, [total[a], center[a], own[a]]));
+                }
+            }
+            let Some(row) = at.checked_sub(nc) else { continue };
+            let by_y = &mut by_y[row * unknowns..][..unknowns];
+            let by_theta = &mut by_theta[row * stride..][..stride];
+            by_theta[..nd].copy_from_slice(&gradient[..nd]);
+            center.iter_mut().zip(gradient).for_each(|(to, from)| *to = *from * 0.5);
+            for (c, turn, _) in &turns {
+                let by_center = chart(*c).exp().apply(three(gradient, *c));
+                put(by_theta, *c, turn.half().apply(by_center));
+                let half = turn.dexp_of_half().apply_transposed(by_center.scaled(0.5));
+                put(&mut center, *c, half);
+            }
+            for (b, entries) in by_y.chunks_exact_mut(count).enumerate() {
+                let parts = entries.iter_mut().zip(part);
+                parts.for_each(|(entry, part)| *entry = gradient[b] * *part + center[b]);
+            }
+            for (c, ..) in &turns {
+                let own = chart(*c).dexp().apply_transposed(three(gradient, *c));
+                for (b, own) in own.0.into_iter().enumerate() {
+                    let entries = by_y[(c + b) * count..][..count].iter_mut().zip(part);
+                    entries.for_each(|(entry, part)| *entry = own * *part + center[c + b]);
+                }
+            }
+            let fraction = tableau.ends[j];
+            for (b, entry) in gradient.iter().enumerate().skip(nd) {
+                by_theta[b] = *entry * (1.0 - fraction);
+                by_theta[theta.next() + b - nd] = *entry * fraction;
             }
         }
     }

@@ -237,7 +237,7 @@ impl System {
             balls.begin(state, &mut self.increment);
         }
         if let Some(closures) = &mut self.closures {
-            closures.begin(at);
+            closures.begin(at, self.balls.as_ref().map_or(&[], |balls| balls.start()));
         }
         for k in 0..d.prescribed {
             let start = state.q[nd + k];
@@ -289,7 +289,8 @@ impl System {
             }
         }
         if let Some(closures) = &mut self.closures {
-            magnitude += closures.evaluate(at, &self.increment, self.width);
+            let balls = self.balls.as_deref_mut();
+            magnitude += closures.evaluate(at, &self.increment, self.width, balls);
         }
         magnitude
     }
@@ -350,14 +351,13 @@ impl System {
     /// Writes the residuals of all stages; returns the largest.
     pub(crate) fn find_residuals(&mut self, state: &PreciseState) -> f64 {
         let size = self.find_linear_residuals(state);
+        if let Some(balls) = &mut self.balls {
+            balls.find_residuals(state, [&self.impulse, &self.momentum], &mut self.residual);
+        }
         if let Some(closures) = &self.closures {
             closures.add_pushes(&mut self.residual);
-        } else if let Some(balls) = &mut self.balls {
-            balls.find_residuals(state, [&self.impulse, &self.momentum], &mut self.residual);
-        } else {
-            return size;
         }
-        largest(&self.residual)
+        if self.balls.is_none() && self.closures.is_none() { size } else { largest(&self.residual) }
     }
 
     /// The largest residual and violation of a constraint, in units of round-off.
@@ -442,7 +442,7 @@ impl System {
     }
 
     /// The same with ball joints, and all other derivatives of the step.
-    fn fill_turned(&mut self, StepContext { settings, state, .. }: StepContext<'_>) {
+    fn fill_turned(&mut self, StepContext { model, settings, state, .. }: StepContext<'_>) {
         let (Some(balls), Some(slopes)) = (&self.balls, &mut self.slopes) else { return };
         let (nd, n, width, count) = (state.p.len(), state.q.len(), self.width, self.count);
         slopes.time_step_s = settings.time_step_s;
@@ -450,7 +450,7 @@ impl System {
         let tables = slopes.second.iter_mut().zip([qq, qv, vq, vv]);
         for (to, from) in tables.chain([(&mut slopes.by_input, qu)]) {
             for (entry, numbers) in from.chunks_exact(width).enumerate() {
-                let stages = to.chunks_exact_mut((from.len() / width).max(1));
+                let stages = to.chunks_exact_mut((from.len() / width).max(1)).take(count);
                 stages.zip(numbers).for_each(|(stage, number)| stage[entry] = *number);
             }
         }
@@ -469,6 +469,15 @@ impl System {
         for a in 0..nd {
             slopes.increment[a] = self.increment[a * width..][..count].iter().sum();
             slopes.start[a] = state.p[a] + state.p_low[a];
+        }
+        if let Some(closures) = &self.closures {
+            closures.place(model, slopes);
+            for (j, o) in
+                (0..=count).flat_map(|j| (0..balls.coordinates.len()).map(move |o| (j, o)))
+            {
+                let at = (count + j) * nd + balls.coordinates[o];
+                slopes.offset[at..at + 3].copy_from_slice(&balls.at_node(o, j).0);
+            }
         }
         slopes.find();
         let rows = self.matrix.matrix.chunks_exact_mut(self.matrix.stride);
@@ -535,7 +544,8 @@ impl System {
             if fresh {
                 self.differentiate(workspace, at, inputs);
                 if let Some(closures) = &mut self.closures {
-                    closures.curve(model, false);
+                    // Of ball joints the start counts, too.
+                    closures.curve(model, self.balls.is_some());
                 }
                 self.fill_matrix(at);
                 report.factorizations += 1;
@@ -543,13 +553,17 @@ impl System {
                     return Err(StepError::NotConverged { iterations: iteration, residual: size });
                 }
                 if let Some(closures) = &mut self.closures {
-                    closures.factor(at, &mut self.matrix)?;
+                    let closing = self.slopes.as_ref().and_then(|slopes| slopes.closing.as_deref());
+                    closures.factor(at, &mut self.matrix, closing)?;
                     closures.write(&mut report);
                     report.reciprocal_condition = workspace.kkt.estimates.matrix;
                 }
             }
             match &mut self.closures {
-                Some(closures) => closures.solve(model, &mut self.matrix, &mut self.residual),
+                Some(closures) => {
+                    let closing = self.slopes.as_ref().and_then(|slopes| slopes.closing.as_deref());
+                    closures.solve(model, &mut self.matrix, &mut self.residual, closing);
+                }
                 None => self.matrix.solve(&mut self.residual),
             }
             let corrections = self.residual.chunks_exact(self.count);
@@ -646,7 +660,10 @@ impl System {
                 self.factor_masses(masses, workspace, at, inputs);
                 true
             }
-            Alike::Middle(middle) => middle.factor(workspace, at, &self.increment, self.width),
+            Alike::Middle(middle) => {
+                let balls = self.balls.as_deref();
+                middle.factor(workspace, at, (&self.increment, self.width), balls)
+            }
         }
     }
 

@@ -7,7 +7,7 @@ use plantd_math::spatial::{Mat3, Vec3, three};
 
 use crate::constraints::closure::Closure;
 use crate::integrator::blocks::StepBlocks;
-use crate::integrator::collocation::slopes::Slopes;
+use crate::integrator::collocation::slopes::{Closing, Slopes};
 use crate::integrator::report::StepError;
 use crate::integrator::scheme::Tableau;
 use crate::linearization::linearize::{Linearization, NodeTangents, Part, StageTangents};
@@ -37,6 +37,22 @@ impl StageTangents {
         stages.fold(Vec3::ZERO, turned)
     }
 
+    /// `Y` of a stage of a coordinate, with the tangent of parameter `a`.
+    fn increment(&self, b: usize, k: usize, a: usize, stride: usize) -> Dual {
+        let Tableau { weights, .. } = &self.tableau;
+        let n = self.q.len() / weights.len();
+        let by = self.tangent[(b * weights.len() + k) * stride + a];
+        Dual::new(self.time_step_s * weights[k] * self.velocity[k * n + b], by)
+    }
+
+    /// Orientation half-way of the ball joint with coordinate `c`, with the tangent of parameter `a`.
+    fn center(&self, o: usize, c: usize, a: usize, increment: &[Dual]) -> Mat3<Dual> {
+        let unit = |k: usize| if a == c + k { 1.0 } else { 0.0 };
+        let axis = Vec3([0, 1, 2].map(|k| Dual::new(0.0, unit(k))));
+        let turned = Mat3::lift(self.orientations[o]).times(&rotation::exp(axis));
+        turned.times(&Turn::new(three(increment, c)).half())
+    }
+
     /// Places a step with ball joints, with the tangent of parameter `a`.
     fn seed(
         &self,
@@ -50,10 +66,7 @@ impl StageTangents {
         let Tableau { nodes, weights, coupling, .. } = &self.tableau;
         let (count, h) = (nodes.len(), self.time_step_s);
         let unit = |is: bool| if is { 1.0 } else { 0.0 };
-        let increment = |b: usize, k: usize| {
-            let by = self.tangent[(b * count + k) * stride + a];
-            Dual::new(h * weights[k] * self.velocity[k * n + b], by)
-        };
+        let increment = |b: usize, k: usize| self.increment(b, k, a, stride);
         for b in 0..nd {
             slopes.increment[b] = (0..count).fold(Dual::ZERO, |sum, k| sum + increment(b, k));
             slopes.start[b] = Dual::new(self.momentum[b], unit(a == n + b));
@@ -77,10 +90,7 @@ impl StageTangents {
                 };
             }
             for (o, &c) in model.orientations.iter().enumerate() {
-                let start = &self.orientations[o];
-                let axis = Vec3([0, 1, 2].map(|k| Dual::new(0.0, unit(a == c + k))));
-                let turned = Mat3::lift(*start).times(&rotation::exp(axis));
-                let center = turned.times(&Turn::new(three(&slopes.increment, c)).half());
+                let center = self.center(o, c, a, &slopes.increment);
                 let offset = Vec3([0, 1, 2].map(|b| {
                     let skew = &self.tableau.skew[i * count..][..count];
                     let along = skew.iter().enumerate().map(|(k, s)| increment(c + b, k) * *s);
@@ -116,6 +126,64 @@ impl StageTangents {
 }
 
 impl NodeTangents {
+    /// Places the nodes of a step with ball joints, with the tangent of parameter `a`; the stages are placed.
+    fn seed(
+        &self,
+        a: usize,
+        model: &Model,
+        stages: &StageTangents,
+        slopes: &mut Slopes<Dual>,
+        closure: &mut Closure<Dual>,
+    ) {
+        let theta = slopes.theta;
+        let (nd, n, nc, stride) = (theta.nd, theta.n(), theta.nc, theta.stride);
+        let Tableau { weights, reach, ends, .. } = &stages.tableau;
+        let count = weights.len();
+        for j in 0..=count {
+            let reach = &reach[j * count..][..count];
+            let mut q = vec![Dual::ZERO; n];
+            for (b, q) in q.iter_mut().enumerate() {
+                let moves = theta.moves(b, ends[j]).filter(|(parameter, _)| *parameter == a);
+                let given: f64 = moves.map(|(_, part)| part).sum();
+                let of = |(k, kappa): (usize, &f64)| {
+                    kappa * stages.tangent[(b * count + k) * stride + a]
+                };
+                let found: f64 = if b < nd { reach.iter().enumerate().map(of).sum() } else { 0.0 };
+                *q = Dual::new(self.q[j * n + b], given + found);
+            }
+            let mut orientations = vec![Mat3::IDENTITY; model.orientations.len()];
+            for (o, &c) in model.orientations.iter().enumerate() {
+                let offset = Vec3([0, 1, 2].map(|b| {
+                    let parts = reach.iter().enumerate();
+                    let along = parts
+                        .map(|(k, kappa)| stages.increment(c + b, k, a, stride) * (kappa - 0.5));
+                    along.fold(Dual::ZERO, |sum, x| sum + x)
+                }));
+                let center = stages.center(o, c, a, &slopes.increment);
+                orientations[o] = center.times(&Chart::new(offset).exp());
+                slopes.offset[(count + j) * nd + c..][..3].copy_from_slice(&offset.0);
+            }
+            closure.evaluate(model, &q, &orientations);
+            closure.differentiate(model, &q);
+            if let Some(closing) = &mut slopes.closing {
+                closing.jacobians[j * nc * n..][..nc * n].copy_from_slice(&closure.jacobian);
+            }
+            if j == count {
+                continue;
+            }
+            let multipliers: Vec<Dual> = (j * nc..(j + 1) * nc)
+                .map(|at| Dual::new(self.multipliers[at], self.tangent[at * stride + a]))
+                .collect();
+            let push = &mut slopes.torque[(count + j) * nd..][..nd];
+            push.fill(Dual::ZERO);
+            closure.subtract_impulses(model, &multipliers, push);
+            let mut hessian = vec![Dual::ZERO; n * n];
+            closure.hessian(model, &q, &multipliers, &mut hessian);
+            let curvature = slopes.second[0][(count + j) * nd * n..].iter_mut();
+            curvature.zip(&hessian[..nd * n]).for_each(|(to, from)| *to = -*from);
+        }
+    }
+
     /// Finds `ν` from `−o_Y`, and adds `−Gᵀ ν` to that.
     fn add_adjoint(
         &self,
@@ -130,8 +198,14 @@ impl NodeTangents {
         let row = |j: usize, c: usize| &self.jacobians[(j * nc + c) * n..][..n];
         let each = || (0..count).flat_map(|j| (0..nc).map(move |c| (j, c)));
         let direct = |(j, c): (usize, usize)| {
-            let pulled: f64 = z_p.iter().zip(row(j, c)).map(|(z, entry)| z * entry).sum();
-            weights_multipliers[c] - pulled
+            let pushed: f64 = match &self.closing {
+                Some(closing) => {
+                    let column = closing.next.iter().skip(j * nc + c).step_by(count * nc);
+                    z_p.iter().zip(column).map(|(z, entry)| z * entry).sum()
+                }
+                None => -z_p.iter().zip(row(j, c)).map(|(z, entry)| z * entry).sum::<f64>(),
+            };
+            weights_multipliers[c] + pushed
         };
         let mut nu: Vec<f64> = each().map(direct).collect();
         for (k, o) in adjoint.iter().enumerate() {
@@ -140,6 +214,12 @@ impl NodeTangents {
         }
         let mut schur = self.schur.clone();
         schur.solve_transposed(&mut nu);
+        if let Some(Closing { equations: [by_y, _], .. }) = self.closing.as_deref() {
+            for (row, nu) in by_y.chunks_exact(adjoint.len()).zip(&nu) {
+                adjoint.iter_mut().zip(row).for_each(|(o, entry)| *o -= nu * entry);
+            }
+            return nu;
+        }
         for ((j, c), nu) in each().zip(&nu) {
             let reach = &stages.tableau.reach[(j + 1) * count..][..count];
             for (own, entry) in adjoint.chunks_exact_mut(count).zip(row(j + 1, c)) {
@@ -236,7 +316,7 @@ impl Contraction {
         };
         stages.matrix.solve_transposed(&mut adjoint);
         if !model.orientations.is_empty() {
-            self.contract_turned_stages(model, stages, &adjoint, z);
+            self.contract_turned_stages(model, stages, [&adjoint, &nu], z);
             return;
         }
 
@@ -391,7 +471,7 @@ impl Contraction {
         &mut self,
         model: &Model,
         stages: &StageTangents,
-        adjoint: &[f64],
+        [adjoint, nu]: [&[f64]; 2],
         z: &[f64],
     ) {
         let layout = self.scratch.layout;
@@ -402,8 +482,12 @@ impl Contraction {
         self.quadratic.clear();
         let Self { scratch, quadratic, .. } = self;
         let mut by_unknown = vec![0.0; count * nd];
+        let mut closure = stages.nodes.as_ref().map(|_| Closure::<Dual>::new(model));
         for (a, row) in quadratic.sum.chunks_exact_mut(stride).enumerate().take(size) {
             stages.seed(a, model, &mut slopes, &mut scratch.blocks);
+            if let (Some(nodes), Some(closure)) = (&stages.nodes, &mut closure) {
+                nodes.seed(a, model, stages, &mut slopes, closure);
+            }
             slopes.find();
             by_unknown.fill(0.0);
             row.fill(0.0);
@@ -417,6 +501,12 @@ impl Contraction {
                 let unknowns = unknowns.chunks_exact(count * nd);
                 let rows = unknowns.zip(parameters.chunks_exact(stride));
                 weights.iter().zip(rows).for_each(|(weight, (y, theta))| add(*weight, [y, theta]));
+            }
+            let closing = slopes.closing.as_deref();
+            if let Some(Closing { equations: [unknowns, parameters], .. }) = closing {
+                let unknowns = unknowns.chunks_exact(count * nd);
+                let rows = unknowns.zip(parameters.chunks_exact(stride));
+                nu.iter().zip(rows).for_each(|(weight, (y, theta))| add(*weight, [y, theta]));
             }
             for &c in &model.orientations {
                 let turn = three(&slopes.increment, c);
@@ -432,6 +522,17 @@ impl Contraction {
             }
             let weights = by_unknown.iter().copied();
             add_product(row, &stages.tangent, stride, weights, &mut scratch.terms);
+            if let (Some(nodes), Some(Closing { residual, next, .. })) = (&stages.nodes, closing) {
+                let mut by_impulse = vec![0.0; nu.len()];
+                let pushed = [(adjoint, residual), (&z[n..][..nd], next)];
+                for (weights, rows) in pushed {
+                    for (weight, row) in weights.iter().zip(rows.chunks_exact(nu.len())) {
+                        by_impulse.iter_mut().zip(row).for_each(|(to, by)| *to += weight * by.eps);
+                    }
+                }
+                let weights = by_impulse.into_iter();
+                add_product(row, &nodes.tangent, stride, weights, &mut scratch.terms);
+            }
         }
         // Both orders of derivatives count the same.
         let sum = &mut quadratic.sum;
