@@ -124,7 +124,7 @@ impl Workspace {
     ) -> Result<StepReport, StepError> {
         let StepContext { model, settings, state, .. } = at;
         self.prepare(at);
-        let is_guessed = state.past.predict(settings.time_step_s, &mut self.step.increment);
+        let is_guessed = state.past.predict(&mut self.step.increment);
         if BODIES && !state.past.point.is_empty() {
             self.push(at);
         }

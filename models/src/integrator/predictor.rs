@@ -9,8 +9,7 @@
 //! What a change of the inputs does to an increment is no part of the differences from `∇²` on, and is guessed by
 //! itself ([`push`](super::push)).
 //!
-//! Steps of uneven length interpolate velocities nearby ([`Kind::Trail`]); collocation goes on with its
-//! polynomial ([`Kind::Stages`]).
+//! Collocation goes on with its polynomial ([`Kind::Stages`]).
 
 use plantd_math::scalar::{Compared, Scalar};
 
@@ -22,9 +21,7 @@ use crate::model::mechanism::Model;
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Past {
     kind: Kind,
-    /// Increments: `∇⁰x … ∇⁷x` of each coordinate. Trail: the times of past velocities, relative to the
-    /// present, the last first, then the velocities of each coordinate. Stages: their velocities, stage by
-    /// stage, then forces.
+    /// Increments: `∇⁰x … ∇⁷x` of each coordinate. Stages: their velocities, stage by stage, then forces.
     numbers: Vec<f64>,
     /// Steps seen, up to [`LENGTH`]; of stages 1. Without any there is nothing to guess from.
     known: u8,
@@ -40,19 +37,12 @@ pub(crate) struct Past {
 enum Kind {
     /// Increments of past steps.
     Increments,
-    /// Velocities at the middles of past steps, which may be of any length, forward and backward: a guess is
-    /// the polynomial through those nearest in time.
-    Trail,
     /// What a collocation method with so many stages had at those of its last step.
     Stages(u8),
 }
 
 /// Steps kept.
 pub(crate) const LENGTH: usize = 8;
-/// Velocities at most, of which a guess is made.
-const NODES: usize = 5;
-/// Velocities closer in time than this, relative to the step, count as one.
-const APART: f64 = 0.1;
 
 /// Takes new increments into the differences of past ones, those from `∇²` on less what was pushed, and sums up
 /// their squares, weighed.
@@ -103,7 +93,6 @@ impl Past {
     fn of_size(scheme: Scheme, coordinates: usize) -> Self {
         let kind = match scheme {
             Scheme::Midpoint => Kind::Increments,
-            Scheme::Composition(_) => Kind::Trail,
             Scheme::Gauss(stages) => Kind::Stages(stages as u8),
         };
         let (numbers, point) = (Vec::new(), Point::default());
@@ -130,51 +119,16 @@ impl Past {
         self.kind == Kind::Increments && self.order >= 2
     }
 
-    /// Writes the increments of the next step, of length `h`; false if there is nothing to guess from.
-    pub(crate) fn predict(&self, h: f64, increments: &mut [f64]) -> bool {
+    /// Writes the increments of the next step; false if there is nothing to guess from.
+    pub(crate) fn predict(&self, increments: &mut [f64]) -> bool {
+        if self.kind != Kind::Increments || self.known == 0 {
+            return false;
+        }
         let rows = self.numbers.as_chunks::<LENGTH>().0;
-        match self.kind {
-            Kind::Increments if self.known > 0 => {
-                for (increment, differences) in increments.iter_mut().zip(rows) {
-                    *increment = differences[..usize::from(self.order)].iter().sum();
-                }
-            }
-            Kind::Trail if self.known > 0 => {
-                let weights = self.weights(&rows[0], 0.5 * h, h);
-                for (increment, velocities) in increments.iter_mut().zip(&rows[1..]) {
-                    let velocity: f64 = velocities.iter().zip(&weights).map(|(v, w)| v * w).sum();
-                    *increment = h * velocity;
-                }
-            }
-            _ => return false,
+        for (increment, differences) in increments.iter_mut().zip(rows) {
+            *increment = differences[..usize::from(self.order)].iter().sum();
         }
         true
-    }
-
-    /// Which velocities of a trail the polynomial goes through at a time, and their weights.
-    fn weights(&self, times: &[f64; LENGTH], time: f64, step: f64) -> [f64; LENGTH] {
-        let mut left: [bool; LENGTH] = [true; LENGTH];
-        let mut chosen = [0; NODES];
-        let mut count = 0;
-        while count < NODES {
-            let candidates = (0..usize::from(self.known)).filter(|k| left[*k]);
-            let distance = |k: &usize| (times[*k] - time).abs();
-            let Some(next) = candidates.min_by(|a, b| distance(a).total_cmp(&distance(b))) else {
-                break;
-            };
-            left[next] = false;
-            let is_apart = |k: &usize| (times[*k] - times[next]).abs() > APART * step.abs();
-            if chosen[..count].iter().all(is_apart) {
-                chosen[count] = next;
-                count += 1;
-            }
-        }
-        let mut weights = [0.0; LENGTH];
-        for &k in &chosen[..count] {
-            let others = chosen[..count].iter().filter(|j| **j != k);
-            weights[k] = others.map(|j| (time - times[*j]) / (times[k] - times[*j])).product();
-        }
-        weights
     }
 
     /// Writes what the next step has at its stages; false if there is nothing to guess from.
@@ -201,35 +155,24 @@ impl Past {
         true
     }
 
-    /// Takes note of a step of length `h`. The error of all coordinates is weighed by their `inertia`; `pushed`,
-    /// if it is not empty, is what was guessed of the change of the inputs.
+    /// Takes note of a step. The error of all coordinates is weighed by their `inertia`; `pushed`, if it is not empty,
+    /// is what was guessed of the change of the inputs.
     #[inline(never)]
-    pub(crate) fn record(&mut self, h: f64, increments: &[f64], inertia: &[f64], pushed: &[f64]) {
-        let rows = self.numbers.as_chunks_mut::<LENGTH>().0;
-        match self.kind {
-            Kind::Increments => {
-                let rows = rows.iter_mut().zip(increments).zip(inertia);
-                let errors = if pushed.is_empty() {
-                    difference(rows.map(|((row, x), weight)| (row, *x, 0.0, *weight)))
-                } else {
-                    let rows = rows.zip(pushed);
-                    difference(rows.map(|(((row, x), weight), push)| (row, *x, *push, *weight)))
-                };
-                // Of the differences, as many mean something as there were increments before.
-                let known = usize::from(self.known).clamp(1, LENGTH - 1);
-                self.order = best_order(&errors, known as f64, known) as u8;
-            }
-            Kind::Trail => {
-                rows.iter_mut().for_each(|row| row.copy_within(..LENGTH - 1, 1));
-                let (times, velocities) = rows.split_at_mut(1);
-                times[0][0] = 0.5 * h;
-                times[0].iter_mut().for_each(|time| *time -= h);
-                for (velocities, increment) in velocities.iter_mut().zip(increments) {
-                    velocities[0] = increment / h;
-                }
-            }
-            Kind::Stages(_) => return,
+    pub(crate) fn record(&mut self, increments: &[f64], inertia: &[f64], pushed: &[f64]) {
+        if self.kind != Kind::Increments {
+            return;
         }
+        let rows = self.numbers.as_chunks_mut::<LENGTH>().0;
+        let rows = rows.iter_mut().zip(increments).zip(inertia);
+        let errors = if pushed.is_empty() {
+            difference(rows.map(|((row, x), weight)| (row, *x, 0.0, *weight)))
+        } else {
+            let rows = rows.zip(pushed);
+            difference(rows.map(|(((row, x), weight), push)| (row, *x, *push, *weight)))
+        };
+        // Of the differences, as many mean something as there were increments before.
+        let known = usize::from(self.known).clamp(1, LENGTH - 1);
+        self.order = best_order(&errors, known as f64, known) as u8;
         self.known = (self.known + 1).min(LENGTH as u8);
     }
 
@@ -247,7 +190,6 @@ impl Past {
                 self.numbers.iter_mut().step_by(LENGTH).for_each(|last| *last *= factor);
                 (self.known, self.order) = (self.known.min(1), self.order.min(1));
             }
-            Kind::Trail => {}
             Kind::Stages(_) => self.is_even = false,
         }
     }
@@ -263,7 +205,6 @@ impl Past {
                 };
                 [of_point, self.known, self.order]
             }
-            Kind::Trail => [1, self.known, 0],
             Kind::Stages(stages) => [2, self.known + 2 * u8::from(self.is_even), stages],
         }
     }
@@ -277,7 +218,6 @@ impl Past {
             [0 | 3 | 4, known, order] if known <= longest && order <= known => {
                 (Kind::Increments, known, order, true)
             }
-            [1, known, 0] if known <= longest => (Kind::Trail, known, 0, true),
             [2, flags, stages] if flags < 4 && (2..=STAGES_MAX as u8).contains(&stages) => {
                 (Kind::Stages(stages), flags & 1, 0, flags & 2 == 2)
             }
@@ -297,7 +237,6 @@ impl Past {
     fn length(&self, coordinates: usize) -> usize {
         match self.kind {
             Kind::Increments => LENGTH * coordinates,
-            Kind::Trail => LENGTH * (1 + coordinates),
             Kind::Stages(stages) => 2 * usize::from(stages) * coordinates,
         }
     }
@@ -344,9 +283,9 @@ mod tests {
         let mut predictor = Past::of_size(Scheme::Midpoint, 1);
         let step = |k| {
             let mut predicted = [0.0];
-            predictor.predict(1.0, &mut predicted);
+            predictor.predict(&mut predicted);
             let order = predictor.order;
-            predictor.record(1.0, &[motion(k as f64)], &[1.0], &[]);
+            predictor.record(&[motion(k as f64)], &[1.0], &[]);
             (predicted[0], motion(k as f64), order)
         };
         (0..steps).map(step).collect()
@@ -364,23 +303,6 @@ mod tests {
         let errors: Vec<f64> =
             run(|t| (0.1 * t).sin(), 30).iter().map(|(p, a, _)| (p - a).abs()).collect();
         assert!(errors[2] > 1e-3 && errors[12..].iter().all(|e| *e < 1e-6), "{errors:?}");
-    }
-
-    #[test]
-    fn uneven_steps_forward_and_backward_follow_a_polynomial() {
-        let velocity = |t: f64| 2.0 - t + 3.0 * t * t - 0.5 * t * t * t;
-        let mut trail = Past::of_size(Scheme::Composition(&[]), 1);
-        let mut time = 0.3;
-        for (k, h) in
-            [0.1, 0.17, -0.09, 0.2, 0.11, -0.21, 0.13].into_iter().cycle().take(30).enumerate()
-        {
-            let mut guess = [0.0];
-            trail.predict(h, &mut guess);
-            let actual = h * velocity(time + 0.5 * h);
-            assert!(k < 6 || (guess[0] - actual).abs() < 1e-10, "{} {actual}", guess[0]);
-            trail.record(h, &[actual], &[], &[]);
-            time += h;
-        }
     }
 
     #[test]

@@ -15,14 +15,8 @@
 //! ```text
 //! κ_ji = (∫ ℓ_i) / b_i = ½ (1 + x̃_j) + ½ Σ_k P_k(x_i) (P_{k+1}(x̃_j) − P_{k−1}(x̃_j)),  k = 1 … s − 1
 //! ```
-//!
-//! **Symmetric compositions** take the midpoint rule with the steps `γ_1 h … γ_m h`, forward and
-//! backward, where constraints meet ball joints: the five steps of Suzuki (Phys. Lett. A 146, 1990),
-//! and the nine and seventeen of Kahan and Li (Math. Comp. 66, 1997).
 
 use plantd_math::trigonometry::sin_cos_of;
-
-use crate::model::mechanism::Model;
 
 /// Stages at most.
 pub(crate) const STAGES_MAX: usize = 6;
@@ -33,77 +27,15 @@ pub(crate) enum Scheme {
     Midpoint,
     /// Gauss collocation with so many stages.
     Gauss(usize),
-    /// The midpoint rule with these fractions of the substep.
-    Composition(&'static [f64]),
 }
 
-const SUZUKI_4: [f64; 5] = {
-    // 1 / (4 − ∛4)
-    const G: f64 = 0.414_490_771_794_375_74;
-    [G, G, 1.0 - 4.0 * G, G, G]
-};
-
-const KAHAN_LI_6: [f64; 9] = {
-    const G: [f64; 5] = [
-        0.392_161_444_007_314_1,
-        0.332_599_136_789_359_44,
-        -0.706_246_172_557_639_3,
-        0.082_213_596_293_550_8,
-        0.798_543_990_934_83,
-    ];
-    [G[0], G[1], G[2], G[3], G[4], G[3], G[2], G[1], G[0]]
-};
-
-const KAHAN_LI_8: [f64; 17] = {
-    const G: [f64; 9] = [
-        0.130_202_483_088_890_08,
-        0.561_162_981_775_108_4,
-        -0.389_474_962_644_847_3,
-        0.158_841_906_555_155_6,
-        -0.395_903_894_133_237_57,
-        0.184_539_640_978_315_7,
-        0.258_374_387_686_322_04,
-        0.295_011_723_609_310_3,
-        -0.605_508_533_830_034_5,
-    ];
-    [
-        G[0], G[1], G[2], G[3], G[4], G[5], G[6], G[7], G[8], G[7], G[6], G[5], G[4], G[3], G[2],
-        G[1], G[0],
-    ]
-};
-
 impl Scheme {
-    /// The method that has the order for a model.
-    pub(crate) fn of_order(order: u32, model: &Model) -> Result<Self, &'static str> {
-        let is_composed = model.dimensions().constraints > 0
-            && !model.orientations.is_empty()
-            && std::env::var("COMPOSED").is_ok();
-        match (order, is_composed) {
-            (2, _) => Ok(Self::Midpoint),
-            (4 | 6 | 8 | 12, false) => Ok(Self::Gauss(order as usize / 2)),
-            (4, true) => Ok(Self::Composition(&SUZUKI_4)),
-            (6, true) => Ok(Self::Composition(&KAHAN_LI_6)),
-            (8, true) => Ok(Self::Composition(&KAHAN_LI_8)),
-            (12, true) => {
-                Err("is not there with ball joints and constraints in one scene, which go to 8")
-            }
+    /// The method that has an order.
+    pub(crate) fn of_order(order: u32) -> Result<Self, &'static str> {
+        match order {
+            2 => Ok(Self::Midpoint),
+            4 | 6 | 8 | 12 => Ok(Self::Gauss(order as usize / 2)),
             _ => Err("is none of 2, 4, 6, 8 and 12"),
-        }
-    }
-
-    /// Steps that one substep takes.
-    pub(crate) fn steps(self) -> usize {
-        match self {
-            Self::Midpoint | Self::Gauss(_) => 1,
-            Self::Composition(fractions) => fractions.len(),
-        }
-    }
-
-    /// The fraction of the substep that step `i` takes.
-    pub(crate) fn fraction(self, i: usize) -> f64 {
-        match self {
-            Self::Midpoint | Self::Gauss(_) => 1.0,
-            Self::Composition(fractions) => fractions[i],
         }
     }
 }
@@ -288,18 +220,6 @@ mod tests {
             let row = tableau.onward.iter().skip(i).step_by(4);
             let next: f64 = row.zip(&tableau.nodes).map(|(e, c)| e * motion(*c)).sum();
             assert!((next - motion(1.0 + c)).abs() < 1e-12, "{next}");
-        }
-    }
-
-    /// The sums of odd powers that a symmetric composition of that order must not have.
-    #[test]
-    fn the_fractions_meet_the_conditions_of_order() {
-        for (fractions, order) in [(&SUZUKI_4[..], 4), (&KAHAN_LI_6, 6), (&KAHAN_LI_8, 8)] {
-            for power in (1..order).step_by(2) {
-                let sum: f64 = fractions.iter().map(|g| g.powi(power)).sum();
-                let expected = if power == 1 { 1.0 } else { 0.0 };
-                assert!((sum - expected).abs() < 1e-15, "order {order}: power {power}: {sum:e}");
-            }
         }
     }
 }

@@ -6,7 +6,7 @@ use crate::model::mechanism::Model;
 pub const SUBSTEPS_MAX: u32 = 256;
 /// Most often that a period is halved.
 pub const HALVINGS_MAX: u32 = 8;
-/// Most steps of any length in a period; it is not halved beyond that.
+/// Most steps in a period; it is not halved beyond that.
 pub(crate) const STEPS_MAX: usize = 8192;
 
 /// How a plant is stepped.
@@ -14,8 +14,7 @@ pub(crate) const STEPS_MAX: usize = 8192;
 pub struct Settings {
     /// Control period `h`, s: what a controller sees as one step; finite and greater than zero.
     pub time_step_s: f64,
-    /// Order of accuracy in `h`: 2 is the midpoint rule; 4, 6, 8 and 12 are Gauss collocation, or, with ball
-    /// joints and constraints, symmetric compositions of the midpoint rule, which go to 8.
+    /// Order of accuracy in `h`: 2 is the midpoint rule; 4, 6, 8 and 12 are Gauss collocation.
     pub order: u32,
     /// Steps of the method in a control period, 1 to [`SUBSTEPS_MAX`]. The input is held; prescribed
     /// coordinates move at a constant rate.

@@ -114,7 +114,7 @@ impl Probe<'_> {
         let settings = Settings { order, substeps, ..*self.plant.settings() };
         let stages = match settings.check(&model)? {
             Scheme::Gauss(stages) => stages as u64,
-            Scheme::Midpoint | Scheme::Composition(_) => 1,
+            Scheme::Midpoint => 1,
         };
         let State { q, p, v, step, .. } = self.state.clone();
         let mut plant = Plant::at(model, settings, &Initial::Momentum { q, p, v })?;

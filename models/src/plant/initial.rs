@@ -533,9 +533,8 @@ impl Settings {
         };
         within("substeps", self.substeps, 1, SUBSTEPS_MAX)?;
         within("halvings", self.halvings, 0, HALVINGS_MAX)?;
-        let scheme = Scheme::of_order(self.order, model)
-            .map_err(|what| InitialError::Order { order: self.order, what })?;
         let order = |what| Err(InitialError::Order { order: self.order, what });
+        let scheme = Scheme::of_order(self.order).or_else(order)?;
         if scheme != Scheme::Midpoint && self.force_split == ForceSplit::Paper {
             return order("needs the symmetric force split");
         }

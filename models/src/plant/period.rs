@@ -1,5 +1,4 @@
-//! A control period as a sequence of steps: substeps, compositions, and what is left of a period that had
-//! to be halved.
+//! A control period as a sequence of steps: substeps, and those of a period that had to be halved.
 //!
 //! The input is held over the period. Prescribed coordinates move at a constant rate, so that the step from
 //! the fraction `c` of the period ends with them at `(1 − c') k0 + c' k1`. The multipliers of a period are
@@ -43,7 +42,7 @@ impl Period {
     pub(crate) fn new(model: &Model, scheme: Scheme, state: &PreciseState) -> Self {
         let collocation = match scheme {
             Scheme::Gauss(stages) => Some(Box::new(Collocation::new(model, stages))),
-            Scheme::Midpoint | Scheme::Composition(_) => None,
+            Scheme::Midpoint => None,
         };
         Self {
             scheme,
@@ -107,9 +106,9 @@ impl StepInput {
 }
 
 impl Period {
-    /// Moves on to the solution of a step of length `h`.
-    pub(crate) fn advance(&mut self, model: &Model, workspace: &mut Workspace, h: f64) {
-        self.reached.move_on(model, workspace, self.collocation.as_deref(), h);
+    /// Moves on to the solution of a step.
+    pub(crate) fn advance(&mut self, model: &Model, workspace: &mut Workspace) {
+        self.reached.move_on(model, workspace, self.collocation.as_deref());
         for (sum, impulse) in self.multipliers.iter_mut().zip(&workspace.step.multipliers) {
             *sum += impulse;
         }
@@ -149,7 +148,6 @@ impl PreciseState {
         model: &Model,
         workspace: &Workspace,
         collocation: Option<&Collocation>,
-        h: f64,
     ) {
         let d = model.dimensions;
         let nd = d.dynamic;
@@ -170,7 +168,7 @@ impl PreciseState {
             None => {
                 let inertia = &model.conditioning.inertia;
                 let Response { pushed, point, .. } = &workspace.response;
-                self.past.record(h, &workspace.step.increment, inertia, pushed);
+                self.past.record(&workspace.step.increment, inertia, pushed);
                 self.past.point.follow(point);
             }
         }

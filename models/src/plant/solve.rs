@@ -50,7 +50,7 @@ impl Plant {
         if self.model.turns_prescribed() {
             return 0;
         }
-        let steps = self.settings.substeps as usize * self.period.scheme.steps();
+        let steps = self.settings.substeps as usize;
         let fits = |halvings: &u32| steps << halvings <= STEPS_MAX;
         (0..=self.settings.halvings).rev().find(fits).unwrap_or_default() as u8
     }
@@ -66,8 +66,7 @@ impl Plant {
         let model = &**model;
         let h = settings.time_step_s;
         let count = (settings.substeps as usize) << halvings;
-        let scheme = period.scheme;
-        period.is_reached = count * scheme.steps() > 1 || halvings != state.halvings;
+        period.is_reached = count > 1 || halvings != state.halvings;
         if !period.is_reached {
             let u = period.input.of_step(model, state, h, u, [0.0, 1.0])?;
             let at = StepContext { model, settings, state, u };
@@ -93,31 +92,24 @@ impl Plant {
             constraint_reciprocal_condition: 1.0,
             ..StepReport::default()
         };
-        let mut fraction = 0.0;
+        let settings = Settings { time_step_s: 1.0 / count as f64 * h, ..*settings };
         for substep in 0..count {
-            for part in 0..scheme.steps() {
-                let length = scheme.fraction(part) / count as f64;
-                let is_last = part + 1 == scheme.steps();
-                let end =
-                    if is_last { (substep + 1) as f64 / count as f64 } else { fraction + length };
-                let settings = Settings { time_step_s: length * h, ..*settings };
-                let Period { reached, collocation, input, chain, .. } = &mut *period;
-                let u = input.of_step(model, state, h, u, [fraction, end])?;
-                let at = StepContext { model, settings: &settings, state: reached, u };
-                let start_s = state.time_after_s(fraction, h);
-                let part_report = match out.as_deref_mut() {
-                    None => take(workspace, collocation, at, start_s, None)?,
-                    Some(out) => {
-                        let part = chain.next_part(model, out, fraction, end);
-                        let report = take(workspace, collocation, at, start_s, Some(part))?;
-                        chain.go_on(out);
-                        report
-                    }
-                };
-                period.advance(model, workspace, settings.time_step_s);
-                report.add(&part_report);
-                fraction = end;
-            }
+            let [fraction, end] = [substep, substep + 1].map(|k| k as f64 / count as f64);
+            let Period { reached, collocation, input, chain, .. } = &mut *period;
+            let u = input.of_step(model, state, h, u, [fraction, end])?;
+            let at = StepContext { model, settings: &settings, state: reached, u };
+            let start_s = state.time_after_s(fraction, h);
+            let part_report = match out.as_deref_mut() {
+                None => take(workspace, collocation, at, start_s, None)?,
+                Some(out) => {
+                    let part = chain.next_part(model, out, fraction, end);
+                    let report = take(workspace, collocation, at, start_s, Some(part))?;
+                    chain.go_on(out);
+                    report
+                }
+            };
+            period.advance(model, workspace);
+            report.add(&part_report);
         }
         period.reached.multipliers.copy_from_slice(&period.multipliers);
         if let Some(out) = out {
@@ -128,12 +120,12 @@ impl Plant {
 
     /// Moves on to the solution.
     pub(crate) fn commit(&mut self) {
-        let Self { model, settings, state, workspace, period } = self;
+        let Self { model, state, workspace, period, .. } = self;
         let was = state.halvings;
         if period.is_reached {
             std::mem::swap(state, &mut period.reached);
         } else {
-            state.move_on(model, workspace, period.collocation.as_deref(), settings.time_step_s);
+            state.move_on(model, workspace, period.collocation.as_deref());
         }
         let calm = period.halvings == was && !period.failed;
         state.calm = if calm { state.calm.saturating_add(1).min(CALM) } else { 0 };
