@@ -388,7 +388,7 @@ def measure_growth(plantd):
 
 ERRORS = [1e-2, 1e-4, 1e-6, 1e-8, 1e-10]
 CASES = [("P", 2), ("P", 10), ("D", 2), ("D", 10), ("S", 2), ("S", 10), ("C4", 2)]
-ROBOT_CASES = [("panda", 1), ("go1", 1), ("g1", 1), ("B7", 1), ("go1-feet", 0.2)]
+ROBOT_CASES = [("panda", 1), ("go1", 1), ("g1", 1), ("B7", 1), ("go1-feet", 0.2), ("stewart", 0.5)]
 PRECISIONS = ("", "-fast", "-coarse")
 HIGH_ORDERS = [("plantd", f"order-{order}{to}") for order in (4, 6, 8, 12) for to in PRECISIONS]
 FIXED_STEP = [PLANTD, *HIGH_ORDERS]
