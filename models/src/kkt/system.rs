@@ -125,9 +125,12 @@ impl KktSystem {
     pub(crate) fn new(model: &Model, stride: usize) -> Self {
         let nd = model.dimensions.dynamic;
         let entries = model.elimination.entries();
-        let in_space = (model.is_generated_in_space())
+        let mut in_space = (model.is_generated_in_space())
             .then(|| Derivatives::new(model))
             .filter(|own| own.is_faster(entries));
+        if let Some(in_space) = &mut in_space {
+            in_space.make_room();
+        }
         let is_generated = in_space.is_some() || model.solver == Solver::Spatial;
         let fields = (is_generated && model.has_fields()).then(|| Box::new(Fields::new(model)));
         Self {

@@ -44,7 +44,7 @@ pub(crate) struct Rows<'a> {
     pub(crate) stride: usize,
 }
 
-/// Eight columns of the derivatives; without room until they are found first.
+/// Eight columns of the derivatives; without room until there is need for them.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Columns<const B: usize> {
     /// `F̂` where limbs meet, zero but within a pass, and `T` there.
@@ -114,7 +114,7 @@ fn of_blocks<E: Eight, const B: usize>(blocks: &Flow<Block, B>) -> Flow<E, B> {
 }
 
 impl<const B: usize> Columns<B> {
-    fn make_room(&mut self, recursion: &SpatialRecursion<B>) {
+    pub(super) fn make_room(&mut self, recursion: &SpatialRecursion<B>) {
         let SpatialRecursion { axes, flows, .. } = recursion;
         let Self { flows: up, motions: down, increment, momentum } = self;
         for flows_of_eight in [up, down] {
@@ -346,7 +346,6 @@ impl<const B: usize> InEights for AllColumns<'_, B> {
     #[inline(always)]
     fn run<E: Eight>(self) {
         let Self { recursion, margins, columns, mut rows } = self;
-        columns.make_room(recursion);
         for first in (0..2 * recursion.axes.len()).step_by(LANES) {
             columns.go_up::<E>(recursion, margins, first);
             columns.go_down::<E>(recursion, margins, first, &mut rows);

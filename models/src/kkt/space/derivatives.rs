@@ -34,6 +34,10 @@ impl<const B: usize> Eliminated<B> {
         in_eights(FactorAndKeep { factor, keep: Keep { kept, vectors, own } })
     }
 
+    fn make_room(&mut self) {
+        self.columns.make_room(&self.recursion);
+    }
+
     #[inline(never)]
     fn write(&mut self, rows: Rows<'_>) {
         let Self { recursion, margins, columns } = self;
@@ -124,7 +128,15 @@ impl Derivatives {
         }
     }
 
-    /// Writes all of them into rows of whole blocks.
+    /// Makes room for all of them.
+    pub(crate) fn make_room(&mut self) {
+        match self {
+            Self::OfBodies(all) => all.make_room(),
+            Self::WithFields(all) => all.make_room(),
+        }
+    }
+
+    /// Writes all of them into rows of whole blocks, for which there is room.
     pub(crate) fn write(&mut self, rows: Rows<'_>) {
         match self {
             Self::OfBodies(all) => all.write(rows),

@@ -99,7 +99,9 @@ fn rope(n: usize, more: &str) -> String {
 fn generate(workspace: &mut Workspace, model: &Model) {
     assert!(model.is_generated_in_space());
     workspace.kkt.factored.recursion = Recursion::Spatial(Box::new(Spatial::new(model)));
-    workspace.kkt.in_space = Some(Derivatives::new(model));
+    let mut derivatives = Derivatives::new(model);
+    derivatives.make_room();
+    workspace.kkt.in_space = Some(derivatives);
     workspace.kkt.fields = model.has_fields().then(|| Box::new(Fields::new(model)));
 }
 
