@@ -19,8 +19,8 @@ use crate::model::mechanism::Model;
 /// Of one step of the midpoint rule of a tree it takes O(n) to find and to apply, and O(n) of memory, where `A` and
 /// `B` take O(n²): without constraints, and without springs, dampers and forces that act between two bodies. Springs,
 /// drag and forces at points and frames that act from the world are taken with equal halves
-/// ([`ForceSplit::Symmetric`](crate::ForceSplit)) alone. All else is by the matrices, to the same numbers. The memory is made by the first
-/// [`Plant::differentiate`](crate::Plant::differentiate).
+/// ([`ForceSplit::Symmetric`](crate::ForceSplit)) alone. All else is by the matrices, to the same numbers. The memory
+/// is made by the first [`Plant::differentiate`](crate::Plant::differentiate).
 ///
 /// ```
 /// use std::sync::Arc;
