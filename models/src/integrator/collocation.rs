@@ -14,7 +14,8 @@
 //! joints, are corrected with the mass matrices of the stages, O(n·depth), by corrections that learn from those
 //! before ([`masses`], [`secants`]), until all residuals are at round-off; with constraints, by the linear system of
 //! the midpoint rule ([`middle`]). Where that is slow, because something is stiff, the dense Jacobian is taken after
-//! all.
+//! all; not of ball joints with constraints, as that of a guess which is far off leads to where legs are bent the other
+//! way, and shorter steps do not.
 //!
 //! Prescribed coordinates move at a constant rate, `c_i` of the way at node `i`. Inputs that signals drive
 //! are taken at the nodes.
@@ -82,9 +83,11 @@ impl Collocation {
         self.guess(workspace, at, start_s)?;
         let Self { tableau, inputs, motion, system } = self;
         system.begin(at, motion, inputs, &mut workspace.mid.input_force);
+        let has_both = system.balls.is_some() && system.closures.is_some();
         let mut report = match system.correct_alike(workspace, at, inputs) {
-            Some(report) => report,
-            None => {
+            Some(Ok(report)) => report,
+            Some(Err(error)) if has_both => return Err(explain(workspace, at, error)),
+            _ => {
                 system.make_dense(at.model, tableau);
                 system.begin(at, motion, inputs, &mut workspace.mid.input_force);
                 let corrected = system.correct(workspace, at, inputs);

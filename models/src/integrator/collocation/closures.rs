@@ -364,37 +364,10 @@ impl Closures {
     }
 
     /// From the residuals of the stages to the change `−ΔY`, and on to the next impulses.
-    pub(super) fn solve(
-        &mut self,
-        model: &Model,
-        matrix: &mut DenseInverse,
-        x: &mut [f64],
-        closing: Option<&Closing>,
-    ) {
-        let stride = self.stride();
-        matrix.solve(x);
-        match closing {
-            None => self.find_gaps(model, x),
-            Some(Closing { equations: [by_y, _], .. }) => {
-                let values = self.at[1..].iter().flat_map(|at| &at.value);
-                let rows = by_y.chunks_exact(x.len()).zip(values);
-                for (gap, (row, value)) in self.correction.iter_mut().zip(rows) {
-                    *gap = row.iter().zip(&*x).map(|(entry, x)| entry * x).sum::<f64>() - value;
-                }
-            }
-        }
-        self.schur.solve(&mut self.correction);
-        for (x, row) in x.iter_mut().zip(self.responses.chunks_exact(stride)) {
-            *x -= row.iter().zip(&self.correction).map(|(r, c)| r * c).sum::<f64>();
-        }
-        let pairs = self.multipliers.iter_mut().zip(&self.correction);
-        pairs.for_each(|(lambda, change)| *lambda -= change);
-    }
-
-    /// `G x − h`.
-    fn find_gaps(&mut self, model: &Model, x: &[f64]) {
+    pub(super) fn solve(&mut self, model: &Model, matrix: &mut DenseInverse, x: &mut [f64]) {
         let n = model.dimensions.coordinates();
-        let (count, nc) = (self.count, self.equations());
+        let (count, nc, stride) = (self.count, self.equations(), self.stride());
+        matrix.solve(x);
         for j in 1..=count {
             let reach = &self.reach[j * count..][..count];
             for (moved, x) in self.moved.iter_mut().zip(x.chunks_exact(count)) {
@@ -407,6 +380,12 @@ impl Closures {
                 self.correction[(j - 1) * nc + c] = along - at.value[c];
             }
         }
+        self.schur.solve(&mut self.correction);
+        for (x, row) in x.iter_mut().zip(self.responses.chunks_exact(stride)) {
+            *x -= row.iter().zip(&self.correction).map(|(r, c)| r * c).sum::<f64>();
+        }
+        let pairs = self.multipliers.iter_mut().zip(&self.correction);
+        pairs.for_each(|(lambda, change)| *lambda -= change);
     }
 
     /// Adds to the derivatives of the residuals, of `Σ P` and of its slopes by the parameters `(q, p, u, k)` and by

@@ -511,7 +511,8 @@ impl System {
         }
     }
 
-    /// Corrects all stages by chord Newton; the Jacobian is renewed where that saves corrections.
+    /// Corrects all stages by chord Newton; the Jacobian is renewed where that saves corrections. Not for ball joints
+    /// with constraints.
     pub(super) fn correct(
         &mut self,
         workspace: &mut Workspace,
@@ -544,8 +545,7 @@ impl System {
             if fresh {
                 self.differentiate(workspace, at, inputs);
                 if let Some(closures) = &mut self.closures {
-                    // Of ball joints the start counts, too.
-                    closures.curve(model, self.balls.is_some());
+                    closures.curve(model, false);
                 }
                 self.fill_matrix(at);
                 report.factorizations += 1;
@@ -553,17 +553,13 @@ impl System {
                     return Err(StepError::NotConverged { iterations: iteration, residual: size });
                 }
                 if let Some(closures) = &mut self.closures {
-                    let closing = self.slopes.as_ref().and_then(|slopes| slopes.closing.as_deref());
-                    closures.factor(at, &mut self.matrix, closing)?;
+                    closures.factor(at, &mut self.matrix, None)?;
                     closures.write(&mut report);
                     report.reciprocal_condition = workspace.kkt.estimates.matrix;
                 }
             }
             match &mut self.closures {
-                Some(closures) => {
-                    let closing = self.slopes.as_ref().and_then(|slopes| slopes.closing.as_deref());
-                    closures.solve(model, &mut self.matrix, &mut self.residual, closing);
-                }
+                Some(closures) => closures.solve(model, &mut self.matrix, &mut self.residual),
                 None => self.matrix.solve(&mut self.residual),
             }
             let corrections = self.residual.chunks_exact(self.count);
@@ -589,13 +585,13 @@ impl System {
     }
 
     /// Corrects all stages with the mass matrices of the guess, or, with constraints, with the system of its middle;
-    /// `None` if that takes too long.
+    /// `None` if few unknowns are not corrected that way. The error says that it takes too long.
     pub(super) fn correct_alike(
         &mut self,
         workspace: &mut Workspace,
         at: StepContext<'_>,
         inputs: &[f64],
-    ) -> Option<StepReport> {
+    ) -> Option<Result<StepReport, StepError>> {
         let StepContext { settings, state, .. } = at;
         let mut alike = self.alike.take()?;
         let enough = match settings.precision {
@@ -604,7 +600,7 @@ impl System {
         };
         let mut report = StepReport::default();
         let (mut previous, mut sluggish) = (f64::INFINITY, 0);
-        let mut solved = None;
+        let mut is_solved = false;
         for iteration in 1..=settings.max_iterations {
             report.iterations = iteration;
             let magnitude = self.evaluate(workspace, at, inputs);
@@ -634,7 +630,7 @@ impl System {
                     self.find_residuals(state);
                 }
                 workspace.kkt.estimates.write(&mut report);
-                solved = Some(report);
+                is_solved = true;
                 break;
             }
             sluggish = if size > SLUGGISH * previous { sluggish + 1 } else { 0 };
@@ -644,7 +640,8 @@ impl System {
             previous = size;
         }
         self.alike = Some(alike);
-        solved
+        let failed = StepError::NotConverged { iterations: report.iterations, residual: previous };
+        Some(if is_solved { Ok(report) } else { Err(failed) })
     }
 
     /// Factors what is alike in all rounds at the last evaluation; false if that is singular.
