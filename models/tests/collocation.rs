@@ -141,20 +141,20 @@ fn apart(model: &Model, a: &[f64], b: &[f64]) -> f64 {
 /// All orders find the motion that the midpoint rule tends to, each at its own rate.
 #[test]
 fn every_order_is_what_it_says() {
-    follow(&acrobat(-9.81, ""), 100, [(4, 16), (6, 12), (8, 8), (12, 4)]);
+    follow(&acrobat(-9.81, ""), [64, 100], [(4, 16), (6, 12), (8, 8), (12, 4)]);
 }
 
 /// The same with constraints.
 #[test]
 fn every_order_is_what_it_says_with_constraints() {
     let scene = acrobat(-9.81, &(HELD.to_owned() + CUFFED));
-    follow(&scene, 200, [(4, 96), (6, 96), (8, 32), (12, 24)]);
+    follow(&scene, [128, 200], [(4, 96), (6, 96), (8, 32), (12, 24)]);
 }
 
-/// By the midpoint rule in so many steps and more, and by other orders from few steps on.
-fn follow(scene: &Scene, steps: u32, coarse: [(u32, u32); 4]) {
+/// By order 12 in many steps, by the midpoint rule in so many and more, and by other orders from few on.
+fn follow(scene: &Scene, [most, steps]: [u32; 2], coarse: [(u32, u32); 4]) {
     let model = Model::compile(scene).unwrap();
-    let reference = end(scene, 12, 128, 0.4);
+    let reference = end(scene, 12, most, 0.4);
     // The midpoint rule, whose error is even in the step: extrapolated twice.
     let [a, b, c] = [1, 2, 4].map(|times| end(scene, 2, times * steps, 0.4));
     let toward = |coarse: &[f64], fine: &[f64], by: f64| {
@@ -169,7 +169,7 @@ fn follow(scene: &Scene, steps: u32, coarse: [(u32, u32); 4]) {
         let [coarse, fine] =
             [steps, 2 * steps].map(|n| apart(&model, &reference, &end(scene, order, n, 0.4)));
         let rate = (coarse / fine).log2();
-        assert!((rate - f64::from(order)).abs() < 1.0, "{order}: {coarse:e} {fine:e}: {rate}");
+        assert!((rate - f64::from(order)).abs() < 0.7, "{order}: {coarse:e} {fine:e}: {rate}");
     }
 }
 

@@ -56,6 +56,8 @@ pub(crate) struct Tableau {
     pub(crate) ends: Vec<f64>,
     /// `κ_ji = (∫ ℓ_i) / b_i` from the start to the node `j` of Lobatto, row-major.
     pub(crate) reach: Vec<f64>,
+    /// `κ_ji − ½`, the same way: from the middle of the step.
+    pub(crate) reach_from_middle: Vec<f64>,
     /// What a node has of the constraint impulses of a step where forces are constant: that of the start has what
     /// the end of the step before has, too.
     pub(crate) shares: Vec<f64>,
@@ -148,9 +150,10 @@ impl Tableau {
             let weight = 1.0 / (count * (count + 1.0) * legendre(*x)[stages].powi(2));
             if j == 0 { 2.0 * weight } else { weight }
         };
+        let reach_from_middle = reach.iter().map(|kappa| kappa - 0.5).collect();
         let shares = ends[..stages].iter().enumerate().map(share).collect();
         let ends = ends.iter().map(|x| 0.5 + 0.5 * x).collect();
-        Self { nodes, weights, coupling, skew, onward, ends, reach, shares }
+        Self { nodes, weights, coupling, skew, onward, ends, reach, reach_from_middle, shares }
     }
 }
 

@@ -84,8 +84,8 @@ impl Collocation {
         if !system.matrix.invert() {
             return Err(StepError::NotFinite { iterations: 0 });
         }
+        let closing = system.slopes.as_ref().and_then(|slopes| slopes.closing.as_deref());
         if let Some(closures) = &mut system.closures {
-            let closing = system.slopes.as_ref().and_then(|slopes| slopes.closing.as_deref());
             closures.factor(at, &mut system.matrix, closing)?;
         }
         if system.slopes.is_some() {
@@ -95,7 +95,6 @@ impl Collocation {
         }
         let StageTangents { tangent, impulses, slopes, terms, nodes, .. } = &mut *tangents;
         let mut curvature = vec![0.0; if nodes.is_some() { nd * stride } else { 0 }];
-        let closing = system.slopes.as_ref().and_then(|slopes| slopes.closing.as_deref());
         if let (Some(closures), None) = (&system.closures, closing) {
             closures.add_slopes(&theta, tangent, &mut curvature, slopes);
         }

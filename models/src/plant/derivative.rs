@@ -18,7 +18,7 @@ impl Plant {
         out: &mut StepDerivative,
     ) -> Result<StepReport, StepError> {
         out.begin(&self.model);
-        if self.period.collocation.is_some() || !is_generated(&self.model, &self.settings) {
+        if !self.is_one_midpoint_step() || !is_generated(&self.model, &self.settings) {
             return self.differentiate_by_matrices(u, out);
         }
         let mut report = self.solve(u, None)?;

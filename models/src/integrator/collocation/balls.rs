@@ -64,12 +64,13 @@ pub(crate) struct Balls {
     torque: Vec<f64>,
     /// `Λ`.
     carried: Vec<Vec3>,
-    pub(crate) nodes: Option<Box<Nodes>>,
+    /// With constraints.
+    nodes: Option<Box<Nodes>>,
 }
 
 /// The ball joints where constraints hold.
 #[derive(Clone, Debug)]
-pub(crate) struct Nodes {
+struct Nodes {
     /// `κ_jk − ½`, node after node.
     skew: Vec<f64>,
     /// Of each node, joint after joint.
@@ -126,7 +127,7 @@ impl Balls {
             carried: vec![Vec3::ZERO; no],
             nodes: (model.dimensions.constraints > 0).then(|| {
                 Box::new(Nodes {
-                    skew: tableau.reach.iter().map(|kappa| kappa - 0.5).collect(),
+                    skew: tableau.reach_from_middle.clone(),
                     charts: vec![Chart::new(Vec3::ZERO); no * tableau.ends.len()],
                     orientations: vec![Mat3::IDENTITY; no],
                     torque: vec![Vec3::ZERO; no],
@@ -184,11 +185,12 @@ impl Balls {
         &self.orientations[g * no..][..no]
     }
 
-    /// Orientations at the start, and half-way.
+    /// Orientations at the start.
     pub(super) fn start(&self) -> &[Mat3] {
         &self.start
     }
 
+    /// Orientations half-way.
     pub(super) fn centers(&self) -> &[Mat3] {
         &self.centers
     }

@@ -11,8 +11,9 @@
 //! ```
 //!
 //! which [`balls`](super::balls) has for ball joints. These are the equations of the discrete action
-//! `Σ h b_i L(Q_i, V_i) − Σ_j<s Λ_j·h(Q̃_j)`: the method is symplectic, and keeps momenta. Of `J = ∂R/∂Y`, `B = ∂R/∂Λ` and `G = ∂h/∂Y` corrections take the inverse of
-//! `J` and the factors of `S = G J⁻¹ B`, whose dependent rows are treated as those of the midpoint rule.
+//! `Σ h b_i L(Q_i, V_i) − Σ_j<s Λ_j·h(Q̃_j)`: the method is symplectic, and keeps momenta. Of `J = ∂R/∂Y`,
+//! `B = ∂R/∂Λ` and `G = ∂h/∂Y` corrections take the inverse of `J` and the factors of `S = G J⁻¹ B`, whose dependent
+//! rows are treated as those of the midpoint rule.
 
 use plantd_math::dense_inverse::DenseInverse;
 use plantd_math::norms::larger;

@@ -104,7 +104,7 @@ impl<S: Scalar> Slopes<S> {
         let places = count + nodes;
         let mut skew = tableau.skew.clone();
         if nodes > 0 {
-            skew.extend(tableau.reach.iter().map(|kappa| kappa - 0.5));
+            skew.extend_from_slice(&tableau.reach_from_middle);
         }
         let impulses = nodes * theta.nc;
         let table = |columns: usize| zeros(places * nd * columns);
@@ -148,11 +148,12 @@ impl<S: Scalar> Slopes<S> {
     /// Finds all derivatives.
     pub(crate) fn find(&mut self) {
         self.total.fill(S::ZERO);
-        for place in 0..self.places {
-            self.turn_place(place);
+        let lengths = self.lengths();
+        for (place, [length, _]) in lengths.iter().enumerate() {
+            self.turn_place(place, *length);
         }
-        self.find_center();
-        self.find_residuals();
+        self.find_center(&lengths);
+        self.find_residuals(&lengths);
         self.find_next();
         self.close();
     }
@@ -164,10 +165,9 @@ impl<S: Scalar> Slopes<S> {
         stages.chain(ends.iter().map(|c| [1.0, *c])).take(self.places).collect()
     }
 
-    /// Derivatives at a place by `η`, `V` and the centre.
-    fn turn_place(&mut self, place: usize) {
+    /// Derivatives at a place, where something acts for so long, by `η`, `V` and the centre.
+    fn turn_place(&mut self, place: usize, length: f64) {
         let (nd, n, ni) = (self.theta.nd, self.theta.n(), self.theta.ni);
-        let length = self.lengths()[place][0];
         let own = place * nd..(place + 1) * nd;
         let of = |columns: usize| own.start * columns..own.end * columns;
         let [qq, qv, vq, vv] = self.second.each_mut().map(|table| &mut table[of(n)]);
@@ -238,17 +238,17 @@ impl<S: Scalar> Slopes<S> {
     }
 
     /// Derivatives of `ΣT` and of the momentum at the centre.
-    fn find_center(&mut self) {
+    fn find_center(&mut self, lengths: &[[f64; 2]]) {
         let (nd, n, ni, stride) = (self.theta.nd, self.theta.n(), self.theta.ni, self.theta.stride);
         let (inputs, next, count) = (self.theta.inputs(), self.theta.next(), self.count);
-        let (h, skew, lengths) = (self.time_step_s, &self.skew, self.lengths());
+        let (h, skew) = (self.time_step_s, &self.skew);
         // How the centre turns with the increment, and with the start.
         let turns: Vec<(usize, Turn<S>)> =
             self.balls.iter().map(|&c| (c, Turn::new(three(&self.increment, c)))).collect();
         let [total_y, total_theta] = &mut self.total_by;
         total_y.fill(S::ZERO);
         total_theta.fill(S::ZERO);
-        for (place, [length, node]) in lengths.into_iter().enumerate() {
+        for (place, &[length, node]) in lengths.iter().enumerate() {
             for a in 0..nd {
                 let at = (place * nd + a) * n;
                 let by_y = &mut total_y[a * nd * count..][..nd * count];
@@ -337,10 +337,10 @@ impl<S: Scalar> Slopes<S> {
     }
 
     /// Derivatives of `R_j = Λ + Σ σ_ji h_i F_i − m̃_j`.
-    fn find_residuals(&mut self) {
+    fn find_residuals(&mut self, lengths: &[[f64; 2]]) {
         let (nd, n, ni, stride) = (self.theta.nd, self.theta.n(), self.theta.ni, self.theta.stride);
         let (inputs, next, count) = (self.theta.inputs(), self.theta.next(), self.count);
-        let (skew, lengths, places) = (&self.skew, self.lengths(), self.places);
+        let (skew, places) = (&self.skew, self.places);
         let h = self.time_step_s;
         let [residual_y, residual_theta] = &mut self.residual;
         let [center_y, center_theta] = &self.center_by;

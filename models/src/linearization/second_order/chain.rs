@@ -137,10 +137,11 @@ impl NodeTangents {
     ) {
         let theta = slopes.theta;
         let (nd, n, nc, stride) = (theta.nd, theta.n(), theta.nc, theta.stride);
-        let Tableau { weights, reach, ends, .. } = &stages.tableau;
+        let Tableau { weights, reach, reach_from_middle, ends, .. } = &stages.tableau;
         let count = weights.len();
         for j in 0..=count {
-            let reach = &reach[j * count..][..count];
+            let [reach, offsets] =
+                [reach, reach_from_middle].map(|rows| &rows[j * count..][..count]);
             let mut q = vec![Dual::ZERO; n];
             for (b, q) in q.iter_mut().enumerate() {
                 let moves = theta.moves(b, ends[j]).filter(|(parameter, _)| *parameter == a);
@@ -154,9 +155,9 @@ impl NodeTangents {
             let mut orientations = vec![Mat3::IDENTITY; model.orientations.len()];
             for (o, &c) in model.orientations.iter().enumerate() {
                 let offset = Vec3([0, 1, 2].map(|b| {
-                    let parts = reach.iter().enumerate();
-                    let along = parts
-                        .map(|(k, kappa)| stages.increment(c + b, k, a, stride) * (kappa - 0.5));
+                    let parts = offsets.iter().enumerate();
+                    let along =
+                        parts.map(|(k, part)| stages.increment(c + b, k, a, stride) * *part);
                     along.fold(Dual::ZERO, |sum, x| sum + x)
                 }));
                 let center = stages.center(o, c, a, &slopes.increment);
