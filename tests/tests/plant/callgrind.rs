@@ -192,7 +192,7 @@ const TOLERANCE: f64 = 0.05;
 const HEADER: &str = "\
 # Instructions per call, counted by callgrind from the initial configuration on; \
 riccati: per step of the recursion.
-# To renew: UPDATE_INSTRUCTIONS=1 cargo test -p plantd-tests --test plant callgrind
+# To renew: CARGO_INCREMENTAL=0 UPDATE_INSTRUCTIONS=1 cargo test -p plantd-tests --test plant callgrind
 
 ";
 
