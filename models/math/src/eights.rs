@@ -54,6 +54,12 @@ pub trait Eight: Copy + 'static {
     fn minus(self, o: Self) -> Self;
     /// The product, number by number.
     fn times(self, o: Self) -> Self;
+    /// The quotient, number by number.
+    fn over(self, o: Self) -> Self;
+    /// The square root of each number.
+    fn sqrt(self) -> Self;
+    /// Each number with the sign of another one.
+    fn signed(self, o: Self) -> Self;
     /// The sum of all: of halves, of their halves, and of what is left.
     fn sum(self) -> f64;
     /// The first numbers of all, the second ones, and so on.
@@ -155,6 +161,18 @@ impl Eight for Block {
         Self(std::array::from_fn(|i| self.0[i] * o.0[i]))
     }
     #[inline(always)]
+    fn over(self, o: Self) -> Self {
+        Self(std::array::from_fn(|i| self.0[i] / o.0[i]))
+    }
+    #[inline(always)]
+    fn sqrt(self) -> Self {
+        Self(std::array::from_fn(|i| self.0[i].sqrt()))
+    }
+    #[inline(always)]
+    fn signed(self, o: Self) -> Self {
+        Self(std::array::from_fn(|i| self.0[i].copysign(o.0[i])))
+    }
+    #[inline(always)]
     fn transposed(rows: [Self; 8]) -> [Self; 8] {
         let mut out = rows;
         for (i, row) in out.iter_mut().enumerate() {
@@ -170,6 +188,65 @@ impl Eight for Block {
     }
 }
 
+/// The first of eight numbers alone, where the others are of no use.
+impl Eight for f64 {
+    type Four = Self;
+    const ZERO: Self = 0.0;
+    const ONE: Self = 1.0;
+    #[inline(always)]
+    fn of_list(list: &[f64]) -> Self {
+        list[0]
+    }
+    #[inline(always)]
+    fn put_list(self, list: &mut [f64]) {
+        list[0] = self;
+    }
+    #[inline(always)]
+    fn all(number: f64) -> Self {
+        number
+    }
+    #[inline(always)]
+    fn plus(self, o: Self) -> Self {
+        self + o
+    }
+    #[inline(always)]
+    fn minus(self, o: Self) -> Self {
+        self - o
+    }
+    #[inline(always)]
+    fn times(self, o: Self) -> Self {
+        self * o
+    }
+    #[inline(always)]
+    fn over(self, o: Self) -> Self {
+        self / o
+    }
+    #[inline(always)]
+    fn sqrt(self) -> Self {
+        self.sqrt()
+    }
+    #[inline(always)]
+    fn signed(self, o: Self) -> Self {
+        self.copysign(o)
+    }
+    #[inline(always)]
+    fn sum(self) -> f64 {
+        self
+    }
+    #[inline(always)]
+    fn transposed([first, ..]: [Self; 8]) -> [Self; 8] {
+        [first, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    }
+    #[inline(always)]
+    fn spread(numbers: [Self; 8], rows: &mut [Block]) {
+        rows[0] = Block(numbers);
+    }
+    #[inline(always)]
+    fn collect(rows: &[Block]) -> [Self; 8] {
+        rows[0].0
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -179,11 +256,11 @@ mod tests {
     struct All<'a>([&'a Block; 2]);
 
     impl InEights for All<'_> {
-        type Output = [Block; 13];
+        type Output = [Block; 16];
         #[inline(always)]
-        fn run<E: Eight>(self) -> [Block; 13] {
+        fn run<E: Eight>(self) -> [Block; 16] {
             let [a, b] = self.0.map(|block| E::of(block));
-            let mut out = [Block::ZERO; 13];
+            let mut out = [Block::ZERO; 16];
             a.plus(b).put(&mut out[0]);
             a.minus(b).put(&mut out[1]);
             a.times(b).put(&mut out[2]);
@@ -193,6 +270,9 @@ mod tests {
             for (own, row) in E::transposed(rows).into_iter().zip(&mut out[5..]) {
                 own.put(row);
             }
+            a.over(b).put(&mut out[13]);
+            b.times(b).sqrt().put(&mut out[14]);
+            a.signed(b).put(&mut out[15]);
             out
         }
     }
@@ -207,6 +287,10 @@ mod tests {
         for i in 0..8 {
             let [x, y] = [a.0[i], b.0[i]];
             assert_eq!([wide[0][i], wide[1][i], wide[2][i]], [x + y, x - y, x * y]);
+            assert_eq!(
+                [wide[13][i], wide[14][i], wide[15][i]],
+                [x / y, (y * y).sqrt(), x.copysign(y)]
+            );
             for (k, entry) in wide[5 + i].iter().enumerate() {
                 assert_eq!(*entry, x + y * k as f64);
             }

@@ -6,13 +6,14 @@
 //! functions of `t`: series near zero, so that no direction and no rate is special.
 
 use crate::scalar::Scalar;
+use crate::sided::Composite;
 use crate::spatial::{Mat3, Vec3};
 use crate::sums::two_sum;
 use crate::trigonometry::sin_cos_of;
 
 /// An orientation, as a unit quaternion `[w, x, y, z]`.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Quaternion(pub [f64; 4]);
+pub struct Quaternion<S = f64>(pub [S; 4]);
 
 impl Default for Quaternion {
     fn default() -> Self {
@@ -35,35 +36,9 @@ impl Quaternion {
         Self(along_quaternion(matrix).0).normalized()
     }
 
-    /// The rotation vector, at most half a turn long.
-    pub fn log(self) -> Vec3 {
-        let [w, x, y, z] = self.0;
-        let vector = Vec3([x, y, z]);
-        let sine = vector.norm();
-        if sine == 0.0 {
-            return Vec3::ZERO;
-        }
-        // `atan2` keeps all digits near half a turn, where the cosine alone would lose them.
-        let angle = 2.0 * libm::atan2(sine, w.abs());
-        vector * (angle.copysign(w) / sine)
-    }
-
     /// `self · o`, normalised.
     pub fn times(self, o: Self) -> Self {
         Self(product(self.0, o.0)).normalized()
-    }
-
-    /// `(self + low) exp(turn)`, and what rounding took from it: the increment, of which no digits cancel,
-    /// is added by compensated sums, so that turns do not drift.
-    pub fn turned(self, low: [f64; 4], turn: Vec3) -> (Self, [f64; 4]) {
-        let change = Turn::new(turn).change();
-        let (of_high, of_low) = (product(self.0, change), product(low, change));
-        let sums = [0, 1, 2, 3].map(|i| two_sum(self.0[i], of_high[i] + (low[i] + of_low[i])));
-        let (high, low) = (sums.map(|(high, _)| high), sums.map(|(_, low)| low));
-        // To length 1: that is no turn.
-        let dot = |a: [f64; 4], b: [f64; 4]| (0..4).map(|i| a[i] * b[i]).sum::<f64>();
-        let excess = 0.5 * (dot(high, high) - 1.0) + dot(high, low);
-        (Self(high), [0, 1, 2, 3].map(|i| low[i] - excess * high[i]))
     }
 
     /// The opposite rotation: the conjugate.
@@ -76,25 +51,112 @@ impl Quaternion {
         let norm = self.0.iter().map(|c| c * c).sum::<f64>().sqrt();
         Self(self.0.map(|c| c / norm))
     }
+}
+
+impl<S: Scalar> Quaternion<S> {
+    /// The rotation vector, at most half a turn long; at half a turn one of the two that there are. Nothing branches,
+    /// and derivatives are finite everywhere.
+    ///
+    /// With `sin a` and `cos a` of half the angle, it is the vector of the quaternion times `2a / sin a`; as
+    /// `sin a = 8 cos(a/2) cos(a/4) cos(a/8) sin(a/8)`, that takes an arcsine of less than 0.2, whose series is short.
+    #[inline(always)]
+    pub fn log(self) -> Vec3<S> {
+        /// `2 asin(√s) / √s = Σ c_i sⁱ`.
+        const fn arcsine() -> [f64; 12] {
+            let (mut c, mut binomial, mut i) = ([0.0; 12], 1.0, 0);
+            while i < 12 {
+                let n = i as f64;
+                c[i] = 2.0 * binomial / (2.0 * n + 1.0);
+                binomial *= (2.0 * n + 1.0) / (2.0 * n + 2.0);
+                i += 1;
+            }
+            c
+        }
+        let [w, x, y, z] = self.0;
+        let vector = Vec3([x, y, z]);
+        let half = |cosine: S| ((cosine + 1.0) * 0.5).sqrt();
+        let a = half(w.signed(S::ONE));
+        let b = half(a);
+        let inverse = (a * b * half(b)).recip();
+        let square = vector.dot(vector) * (inverse * inverse) * (1.0 / 64.0);
+        vector * (by_halves(square, const { &arcsine() }) * inverse).signed(w)
+    }
+
+    /// `(self + low) exp(turn)`, and what rounding took from it: the increment, of which no digits cancel,
+    /// is added by compensated sums, so that turns do not drift.
+    #[inline(always)]
+    pub fn turned(self, low: [S; 4], turn: Vec3<S>) -> (Self, [S; 4]) {
+        let change = Turn::new(turn).change();
+        let (of_high, of_low) = (product(self.0, change), product(low, change));
+        let (mut high, mut next) = (self.0, low);
+        for i in 0..4 {
+            (high[i], next[i]) = two_sum(self.0[i], of_high[i] + (low[i] + of_low[i]));
+        }
+        // To length 1: that is no turn.
+        let dot = |a: [S; 4], b: [S; 4]| (a[0] * b[0] + a[1] * b[1]) + (a[2] * b[2] + a[3] * b[3]);
+        let excess = (dot(high, high) - 1.0) * 0.5 + dot(high, next);
+        for i in 0..4 {
+            next[i] -= excess * high[i];
+        }
+        (Self(high), next)
+    }
 
     /// The rotation matrix.
-    pub fn matrix(self) -> Mat3 {
+    #[inline(always)]
+    pub fn matrix(self) -> Mat3<S> {
         let [w, x, y, z] = self.0;
-        Mat3::from_rows([
-            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+        let (x2, y2, z2) = (x + x, y + y, z + z);
+        let ([wx, wy, wz], [xx, xy, xz]) = ([w * x2, w * y2, w * z2], [x * x2, x * y2, x * z2]);
+        let [yy, yz, zz] = [y * y2, y * z2, z * z2];
+        Mat3([
+            Vec3([S::ONE - (yy + zz), xy + wz, xz - wy]),
+            Vec3([xy - wz, S::ONE - (xx + zz), yz + wx]),
+            Vec3([xz + wy, yz - wx, S::ONE - (xx + yy)]),
         ])
     }
 }
 
-fn product([a, b, c, d]: [f64; 4], [w, x, y, z]: [f64; 4]) -> [f64; 4] {
+#[inline(always)]
+fn product<S: Scalar>([a, b, c, d]: [S; 4], [w, x, y, z]: [S; 4]) -> [S; 4] {
     [
         a * w - b * x - c * y - d * z,
         a * x + b * w + c * z - d * y,
         a * y - b * z + c * w + d * x,
         a * z + b * y - c * x + d * w,
     ]
+}
+
+/// `Σ c_i sⁱ`: even and odd terms beside each other, so that each waits for half as many. Nothing branches.
+#[inline(always)]
+fn by_halves<S: Scalar, const N: usize>(s: S, coefficients: &[f64; N]) -> S {
+    const { assert!(N.is_multiple_of(2)) };
+    let square = s * s;
+    let [mut even, mut odd] = [S::ZERO; 2];
+    let mut i = N;
+    while i > 0 {
+        i -= 2;
+        even = even * square + coefficients[i];
+        odd = odd * square + coefficients[i + 1];
+    }
+    even + odd * s
+}
+
+/// `(−1)ⁱ / (2i + N)!`: of `e_N(s) = Σ (−s)ⁱ / (2i + N)!` for `N ≥ 4` as many terms as half a turn takes; the next is
+/// less than 1e-17 of the first.
+const fn entire<const N: usize>() -> [f64; 14] {
+    let (mut c, mut i) = ([0.0; 14], 0);
+    while i < 14 {
+        let sign = if i % 2 == 0 { 1.0 } else { -1.0 };
+        c[i] = sign * inverse_factorial(2 * i + N);
+        i += 1;
+    }
+    c
+}
+
+/// `e_N = 1/N! − s e_N+2`.
+#[inline(always)]
+fn down<S: Scalar>(s: S, next: S, n: usize) -> S {
+    -(next * s) + inverse_factorial(n)
 }
 
 /// Squares of angles below this are summed as series.
@@ -175,30 +237,9 @@ pub fn exp<S: Scalar>(y: Vec3<S>) -> Mat3<S> {
     polynomial(y, a, b)
 }
 
-/// The rotation vector of a rotation matrix, at most half a turn long; at half a turn one of the two that there
-/// are. Derivatives are finite everywhere: those of the vector that is taken.
+/// The rotation vector of a rotation matrix, as [`Quaternion::log`].
 pub fn log<S: Scalar>(rotation: &Mat3<S>) -> Vec3<S> {
-    /// `2 asin(√s) / √s = Σ c_i sⁱ`.
-    const fn arcsine() -> [f64; 12] {
-        let (mut c, mut binomial, mut i) = ([0.0; 12], 1.0, 0);
-        while i < 12 {
-            let n = i as f64;
-            c[i] = 2.0 * binomial / (2.0 * n + 1.0);
-            binomial *= (2.0 * n + 1.0) / (2.0 * n + 2.0);
-            i += 1;
-        }
-        c
-    }
-    const ARCSINE: [f64; 12] = arcsine();
-    let [w, x, y, z] = quaternion(rotation);
-    let vector = Vec3([x, y, z]);
-    // Of half the angle.
-    let sine = vector.dot(vector);
-    if sine.value() < 0.03 {
-        return vector * series(sine, &ARCSINE);
-    }
-    let sine = sine.sqrt();
-    vector * (sine.atan2(w) * 2.0 * sine.recip())
+    Quaternion(quaternion(rotation)).log()
 }
 
 /// The unit quaternion of a rotation matrix whose first component is not negative.
@@ -248,21 +289,22 @@ pub fn momentum_at_start<S: Scalar>(xi: Vec3<S>) -> Mat3<S> {
 
 /// How a ball joint turns in a step, `ξ`, with the coefficients of all maps that the step needs.
 ///
-/// They are those of half the turn: with `e1`, `e2`, `e3` of `s = |ξ|²/4`,
+/// They are those of half the turn: with `e1 … e5` of `s = |ξ|²/4`,
 ///
 /// ```text
 /// k = tan(t/4) / t = e2 / 2e1      c = (1 − (t/2) cot(t/2)) / t² = (e2 − e3) / 4e1
 /// ```
 ///
-/// of which no digits cancel; all are singular only at a whole turn.
-#[derive(Clone, Copy, Debug)]
+/// of which no digits cancel; all are singular only at a whole turn. Nothing branches, so it takes several turns side
+/// by side.
+#[derive(Clone, Copy, Debug, Default)]
 pub struct Turn<S = f64> {
     /// `ξ`.
     pub xi: Vec3<S>,
     /// `|ξ|²/4`.
     square: S,
-    /// `e1`, `e2` and `e3` of that.
-    half: [S; 3],
+    /// `e1 … e5` of that.
+    half: [S; 5],
     c: S,
     k: S,
 }
@@ -272,10 +314,13 @@ impl<S: Scalar> Turn<S> {
     #[inline(always)]
     pub fn new(xi: Vec3<S>) -> Self {
         let square = xi.dot(xi) * 0.25;
-        let half = exponential(square);
-        let [e1, e2, e3] = half;
+        let e4 = by_halves(square, const { &entire::<4>() });
+        let e5 = by_halves(square, const { &entire::<5>() });
+        let (e2, e3) = (down(square, e4, 2), down(square, e5, 3));
+        let e1 = down(square, e3, 1);
         let inverse = e1.recip() * 0.25;
-        Self { xi, square, half, c: (e2 - e3) * inverse, k: (e2 + e2) * inverse }
+        let (c, k) = ((e2 - e3) * inverse, (e2 + e2) * inverse);
+        Self { xi, square, half: [e1, e2, e3, e4, e5], c, k }
     }
 
     /// `exp(ξ/2)`.
@@ -322,22 +367,49 @@ impl<S: Scalar> Turn<S> {
         Changes { turn: self, c, k }
     }
 
+    /// `exp(ξ) − 1`, as a quaternion: of no component digits cancel.
+    #[inline(always)]
+    fn change(&self) -> [S; 4] {
+        let [e1, e2, ..] = self.half;
+        let Vec3([x, y, z]) = self.xi * (e1 * 0.5);
+        [-(self.square * e2), x, y, z]
+    }
+
     /// `c'` and `k'` by `t²`, from `e_n' = ½ (n e_n+2 − e_n+1)`.
     #[inline(always)]
     fn slopes(&self) -> [S; 2] {
-        let (s, [e1, e2, e3]) = (self.square, self.half);
-        let [e4, e5] = if s.value() < SERIES_BELOW {
-            [series(s, const { &alternating::<4>() }), series(s, const { &alternating::<5>() })]
-        } else {
-            let inverse = s.recip();
-            [(S::constant(0.5) - e2) * inverse, (S::constant(1.0 / 6.0) - e3) * inverse]
-        };
+        let [e1, e2, e3, e4, e5] = self.half;
         // Twice the slopes of e1, e2, e3.
         let (by_e1, by_e2, by_e3) = (e3 - e2, e4 + e4 - e3, e5 * 3.0 - e4);
         let inverse = e1.recip() * (1.0 / 32.0);
         let c = (by_e2 - by_e3 - by_e1 * (self.c * 4.0)) * inverse;
         let k = (by_e2 - by_e1 * (self.k + self.k)) * (inverse + inverse);
         [c, k]
+    }
+}
+
+impl<P: Copy> Composite<P> for Turn<P> {
+    type Of<T: Copy> = Turn<T>;
+    #[inline(always)]
+    fn map<T: Copy>(&self, mut f: impl FnMut(&P) -> T) -> Turn<T> {
+        let [e1, e2, e3, e4, e5] = &self.half;
+        Turn {
+            xi: self.xi.map(&mut f),
+            square: f(&self.square),
+            half: [f(e1), f(e2), f(e3), f(e4), f(e5)],
+            c: f(&self.c),
+            k: f(&self.k),
+        }
+    }
+    #[inline(always)]
+    fn zip<T: Copy>(&mut self, other: Turn<T>, mut f: impl FnMut(&mut P, T)) {
+        self.xi.zip(other.xi, &mut f);
+        f(&mut self.square, other.square);
+        for (own, other) in self.half.iter_mut().zip(other.half) {
+            f(own, other);
+        }
+        f(&mut self.c, other.c);
+        f(&mut self.k, other.k);
     }
 }
 
@@ -378,15 +450,6 @@ impl<S: Scalar> Changes<'_, S> {
     }
 }
 
-impl Turn {
-    /// `exp(ξ) − 1`, as a quaternion: of no component digits cancel.
-    fn change(&self) -> [f64; 4] {
-        let [e1, e2, _] = self.half;
-        let Vec3([x, y, z]) = self.xi * (0.5 * e1);
-        [-self.square * e2, x, y, z]
-    }
-}
-
 /// Rotation vectors `y` as coordinates of the rotations `exp(y)`, with what their derivatives are made of: the
 /// numbers `e_N = Σ (−s)ⁱ / (2i + N)!` of `s = |y|²` for `N ≤ 7`, of which `e_N' = ½ (N e_N+2 − e_N+1)`.
 ///
@@ -408,24 +471,12 @@ impl<S: Scalar> Chart<S> {
     /// At `y`.
     #[inline(always)]
     pub fn new(y: Vec3<S>) -> Self {
-        /// As many terms as half a turn takes: the next is less than 1e-17 of the first.
-        const fn tail<const N: usize>() -> [f64; 13] {
-            let (mut c, mut i) = ([0.0; 13], 0);
-            while i < 13 {
-                let sign = if i % 2 == 0 { 1.0 } else { -1.0 };
-                c[i] = sign * inverse_factorial(2 * i + N);
-                i += 1;
-            }
-            c
-        }
         let square = y.dot(y);
-        let sum = |c: &[f64; 13]| c.iter().rev().fold(S::ZERO, |sum, c| sum * square + *c);
-        let (e6, e7) = (sum(const { &tail::<6>() }), sum(const { &tail::<7>() }));
-        // e_N = 1/N! − s e_N+2
-        let down = |e: S, n: usize| -(e * square) + inverse_factorial(n);
-        let (e4, e5) = (down(e6, 4), down(e7, 5));
-        let (e2, e3) = (down(e4, 2), down(e5, 3));
-        Self { y, square, e: [S::ZERO, down(e3, 1), e2, e3, e4, e5, e6, e7] }
+        let e6 = by_halves(square, const { &entire::<6>() });
+        let e7 = by_halves(square, const { &entire::<7>() });
+        let (e4, e5) = (down(square, e6, 4), down(square, e7, 5));
+        let (e2, e3) = (down(square, e4, 2), down(square, e5, 3));
+        Self { y, square, e: [S::ZERO, down(square, e3, 1), e2, e3, e4, e5, e6, e7] }
     }
 
     /// `exp(y)`.
@@ -632,11 +683,24 @@ mod tests {
         ] {
             assert!((a - b).abs() < 1e-12 * a, "{a} {b}");
         }
-        // Of turns of twice the angle, along one axis.
-        let turn = |s: f64| Turn::new(Vec3([2.0 * s.sqrt(), 0.0, 0.0]));
-        let numbers = |turn: Turn| [[turn.c, turn.k], turn.slopes()].concat();
-        for (a, b) in numbers(turn(below)).iter().zip(numbers(turn(above))) {
-            assert!((a - b).abs() < 1e-12 * a, "{a} {b}");
+    }
+
+    /// The numbers of a turn are the closed forms of their series, to a whole turn and beyond.
+    #[test]
+    fn numbers_of_turns() {
+        for (t, bound) in
+            [(1e-5, 1e-16), (0.1, 1e-16), (1.0, 2e-16), (2.0, 1e-15), (3.0, 5e-15), (6.0, 1e-10)]
+        {
+            let [e1, e2, e3, e4, e5] = Turn::new(Vec3([2.0 * t, 0.0, 0.0])).half;
+            let s = t * t;
+            let differences = [
+                t * e1 - t.sin(),
+                s * e2 - (1.0 - t.cos()),
+                t * s * e3 - (t - t.sin()),
+                s * s * e4 - (0.5 * s - 1.0 + t.cos()),
+                t * s * s * e5 - (t * s / 6.0 - t + t.sin()),
+            ];
+            assert!(differences.iter().all(|d| d.abs() < bound), "{t}: {differences:?}");
         }
     }
 

@@ -4,7 +4,7 @@
 //! from one to the next, such as sums along a tree, takes and puts them one by one.
 
 use crate::scalar::{Scalar, Wide};
-use crate::spatial::{Force, Motion, Pose, Sym3, Vec3};
+use crate::spatial::{Force, Mat3, Motion, Pose, Sym3, Vec3};
 
 /// A vector, a matrix, or several of these, made of numbers `P`.
 pub trait Composite<P: Copy>: Copy {
@@ -26,6 +26,20 @@ impl<P: Copy> Composite<P> for Vec3<P> {
     fn zip<T: Copy>(&mut self, other: Vec3<T>, mut f: impl FnMut(&mut P, T)) {
         for (own, other) in self.0.iter_mut().zip(other.0) {
             f(own, other);
+        }
+    }
+}
+
+impl<P: Copy> Composite<P> for Mat3<P> {
+    type Of<T: Copy> = Mat3<T>;
+    #[inline(always)]
+    fn map<T: Copy>(&self, mut f: impl FnMut(&P) -> T) -> Mat3<T> {
+        Mat3([self.0[0].map(&mut f), self.0[1].map(&mut f), self.0[2].map(&mut f)])
+    }
+    #[inline(always)]
+    fn zip<T: Copy>(&mut self, other: Mat3<T>, mut f: impl FnMut(&mut P, T)) {
+        for (own, other) in self.0.iter_mut().zip(other.0) {
+            own.zip(other, &mut f);
         }
     }
 }

@@ -13,12 +13,18 @@
 //! a whole turn in one step. In the Newton matrix the maps weigh rows and columns of the joint: see
 //! [`crate::lagrangian::generators`]. See [`plantd_math::rotation`] for the maps.
 
+mod maps;
+
 use plantd_math::eights::{Eight, InEights, in_eights};
 use plantd_math::rotation;
 use plantd_math::rotation::{Quaternion, Turn};
+use plantd_math::rows::Block;
+use plantd_math::scalar::Scalar;
+use plantd_math::sided::Sided;
 use plantd_math::spatial::{Mat3, Vec3, three};
 use plantd_math::tree_lu::TreeLu;
 
+use crate::integrator::balls::maps::{ToMatrices, ToMidpoint, TurnOn, Weigh, beside};
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::{Tangents, Workspace};
@@ -38,8 +44,13 @@ pub(crate) struct BallJoints {
     /// Orientations at the start and at the end.
     pub(crate) start: Vec<Mat3>,
     pub(crate) end: Vec<Mat3>,
+    /// Those at the start, side by side.
+    start_beside: Sided<Mat3<Block>>,
     /// How they turn over the step, in their own axes, at the last evaluation.
-    pub(crate) turns: Vec<Turn>,
+    turns: Sided<Turn<Block>>,
+    /// Orientations at the end, and what they lost to rounding.
+    next: Vec<Quaternion>,
+    next_low: Vec<[f64; 4]>,
     /// Of each coordinate the orientation that it is a component of, times four, and the axis.
     places: Vec<u32>,
     /// Of the joints at the midpoint.
@@ -56,14 +67,41 @@ impl BallJoints {
         for (o, &i) in model.orientations.iter().enumerate() {
             (0..3).for_each(|axis| places[i + axis] = (4 * o + axis) as u32);
         }
-        Self {
+        let ends = if model.dimensions.constraints > 0 { no } else { 0 };
+        let mut balls = Self {
             start: vec![Mat3::IDENTITY; no],
             end: vec![Mat3::IDENTITY; no],
-            turns: vec![Turn::new(Vec3::ZERO); no],
+            start_beside: Sided(vec![Mat3([Vec3::default(); 3]); no.div_ceil(f64::BESIDE)]),
+            turns: Sided::zeros::<f64>(no),
+            next: vec![Quaternion::default(); ends],
+            next_low: vec![[0.0; 4]; ends],
             places,
             generators: vec![Generators::default(); if no > 0 { joints } else { 0 }],
             within: vec![[[0.0; 3]; 3]; no],
-        }
+        };
+        balls.stay();
+        balls
+    }
+
+    /// How one turns over the step.
+    #[inline(always)]
+    pub(crate) fn turn(&self, orientation: usize) -> Turn {
+        self.turns.get::<f64>(orientation)
+    }
+
+    /// How all turn over the step.
+    pub(crate) fn turns(&self) -> impl Iterator<Item = Turn> {
+        (0..self.start.len()).map(|o| self.turn(o))
+    }
+
+    /// None turns over the step.
+    pub(crate) fn stay(&mut self) {
+        (0..self.start.len()).for_each(|o| self.set_turn(o, Turn::new(Vec3::ZERO)));
+    }
+
+    /// Replaces how one turns over the step.
+    pub(crate) fn set_turn(&mut self, orientation: usize, turn: Turn) {
+        self.turns.put::<f64>(orientation, turn);
     }
 
     /// The orientation that a coordinate is a component of, and the axis.
@@ -116,8 +154,11 @@ impl Workspace {
         settings: &Settings,
         state: &PreciseState,
     ) {
+        let BallJoints { start, start_beside, .. } = &mut self.balls;
+        let orientations = &state.orientations[..];
+        let task = ToMatrices { orientations, matrices: start, beside: start_beside };
+        beside(orientations.len(), task);
         for (o, &i) in model.orientations.iter().enumerate() {
-            self.balls.start[o] = state.orientations[o].matrix();
             if i >= model.dimensions.dynamic {
                 let end = Quaternion::exp(three(&self.step.q_end, i));
                 let turn = state.orientations[o].inverse().times(end).log();
@@ -131,30 +172,32 @@ impl Workspace {
 
     /// Moves ball joints to the midpoint of the increment.
     pub(crate) fn turn_to_midpoint(&mut self, model: &Model) {
-        for (o, &i) in model.orientations.iter().enumerate() {
-            if i < model.dimensions.dynamic {
-                self.turn_by(o, three(&self.step.increment, i));
-            }
-        }
+        let coordinates = &model.orientations[..];
+        let Self { step, mid, balls: BallJoints { start_beside: start, turns, .. }, .. } = self;
+        let (increment, middle) = (&step.increment[..], &mut mid.orientations[..]);
+        let task = ToMidpoint { coordinates, increment, start, turns, middle };
+        beside(coordinates.len(), task);
     }
 
     /// Moves a ball joint to the middle of a turn.
-    #[inline(always)]
     pub(crate) fn turn_by(&mut self, orientation: usize, xi: Vec3) {
         let turn = Turn::new(xi);
-        self.balls.turns[orientation] = turn;
+        self.balls.set_turn(orientation, turn);
         self.mid.orientations[orientation] = self.balls.start[orientation].times(&turn.half());
     }
 
     /// Moves ball joints to the end of the increment.
     pub(crate) fn turn_to_end(&mut self, model: &Model, state: &PreciseState) {
-        for (o, &i) in model.orientations.iter().enumerate() {
-            if i < model.dimensions.dynamic {
-                let turn = three(&self.step.increment, i);
-                let (end, _) = state.orientations[o].turned(state.orientations_low[o], turn);
-                self.step.q_end[i..i + 3].copy_from_slice(&end.log().0);
-                self.balls.end[o] = end.matrix();
-            }
+        let (coordinates, dynamic) = (&model.orientations[..], model.dimensions.dynamic);
+        let Self { step, balls: BallJoints { end, next, next_low, .. }, .. } = self;
+        next.copy_from_slice(&state.orientations);
+        next_low.copy_from_slice(&state.orientations_low);
+        let (increment, q) = (&step.increment[..], &mut step.q_end[..dynamic]);
+        let (orientations, low) = (&mut next[..], &mut next_low[..]);
+        let task = TurnOn { coordinates, increment, orientations, low, q };
+        beside(coordinates.len(), task);
+        for (o, _) in coordinates.iter().enumerate().filter(|(_, i)| **i < dynamic) {
+            end[o] = next[o].matrix();
         }
     }
 
@@ -162,22 +205,22 @@ impl Workspace {
     pub(crate) fn weigh_balls(&mut self, model: &Model, settings: &Settings) {
         let (h, a) = (settings.time_step_s, settings.force_split.at_start());
         let Self { mid, kkt, balls, .. } = self;
-        for (o, &i) in model.orientations.iter().enumerate() {
-            if i >= model.dimensions.dynamic {
-                continue;
-            }
-            let turn = &balls.turns[o];
-            let weights = &mut kkt.balls[o];
-            *weights = Weights::of_rows(turn);
-            weights.column = turn.dexp_of_half();
-            let impulse = three(&mid.l_q, i) * (0.5 * h) + three(&mid.force, i) * (a * h);
-            let changes = turn.changes();
-            weights.own =
-                changes.of_torque(impulse).minus(&changes.of_momentum(three(&mid.l_v, i)));
-            if let Some(damping) = model.damping.get(i..i + 3) {
-                for (b, c) in damping.iter().enumerate() {
-                    weights.own.0[b] += weights.torque.0[b] * (-a * c);
-                }
+        let coordinates = &model.orientations[..];
+        let task = Weigh {
+            coordinates,
+            turns: &balls.turns,
+            momentum: &mid.l_v,
+            torque: &mid.l_q,
+            force: &mid.force,
+            half: 0.5 * h,
+            weight: a * h,
+            weights: &mut kkt.balls,
+        };
+        beside(coordinates.len(), task);
+        for (weights, &i) in kkt.balls.iter_mut().zip(coordinates) {
+            let Some(damping) = model.damping.get(i..i + 3) else { continue };
+            for (b, c) in damping.iter().enumerate() {
+                weights.own.0[b] += weights.torque.0[b] * (-a * c);
             }
         }
         for a in &model.armature {
@@ -276,15 +319,15 @@ impl Workspace {
 
     /// Moves the orientations of a state to the end of the step.
     pub(crate) fn turn(&self, model: &Model, state: &mut PreciseState) {
-        for (o, &i) in model.orientations.iter().enumerate() {
-            let orientation = &mut state.orientations[o];
-            if i < model.dimensions.dynamic {
-                let low = &mut state.orientations_low[o];
-                (*orientation, *low) = orientation.turned(*low, three(&self.step.increment, i));
-                state.q[i..i + 3].copy_from_slice(&orientation.log().0);
-                state.q_low[i..i + 3].fill(0.0);
-            } else {
-                *orientation = Quaternion::exp(three(&self.step.q_end, i));
+        let (coordinates, dynamic) = (&model.orientations[..], model.dimensions.dynamic);
+        let PreciseState { orientations, orientations_low: low, q, q_low, .. } = state;
+        let (increment, q) = (&self.step.increment[..], &mut q[..dynamic]);
+        let task = TurnOn { coordinates, increment, orientations, low, q };
+        beside(coordinates.len(), task);
+        for (o, &i) in coordinates.iter().enumerate() {
+            match q_low.get_mut(i..i + 3) {
+                Some(low) => low.fill(0.0),
+                None => state.orientations[o] = Quaternion::exp(three(&self.step.q_end, i)),
             }
         }
     }

@@ -212,7 +212,7 @@ impl Workspace {
         // Of m × ξ.
         for (o, i) in orientations() {
             let (m, x) = (three(&mid.l_v, i), three(corrections, i));
-            let change = three(&nudge.l_v, i).cross(balls.turns[o].xi) - m.cross(x);
+            let change = three(&nudge.l_v, i).cross(balls.turn(o).xi) - m.cross(x);
             for (impulse, change) in step.impulse[i..i + 3].iter_mut().zip(change.0) {
                 *impulse += change;
             }

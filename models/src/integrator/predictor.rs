@@ -42,7 +42,7 @@ enum Kind {
 }
 
 /// Steps kept.
-pub(crate) const LENGTH: usize = 8;
+pub(crate) const LENGTH: usize = 12;
 
 /// Takes new increments into the differences of past ones, those from `∇²` on less what was pushed, and sums up
 /// their squares, weighed.

@@ -87,9 +87,9 @@ impl Workspace {
         }
         mid.input_force.copy_from_slice(force);
         mid.force.copy_from_slice(force);
-        for (turn, &i) in self.balls.turns.iter_mut().zip(&model.orientations) {
+        for (o, &i) in model.orientations.iter().enumerate() {
             if i < nd {
-                *turn = Turn::new(three(increment, i));
+                self.balls.set_turn(o, Turn::new(three(increment, i)));
             }
         }
         mid.evaluate(model);

@@ -116,7 +116,7 @@ impl Workspace {
         let at_end = (1.0 - settings.force_split.at_start()) * h;
         let torque = |i: usize| 0.5 * h * mid.l_q[i] + at_end * mid.force[i];
         let mut momentum: Vec<f64> = (0..mid.l_v.len()).map(|i| mid.l_v[i] + torque(i)).collect();
-        for (turn, &i) in self.balls.turns.iter().zip(&model.orientations) {
+        for (turn, &i) in self.balls.turns().zip(&model.orientations) {
             if let Some(momentum) = momentum.get_mut(i..i + 3) {
                 let carried = turn.momentum_at_start().apply_transposed(three(&mid.l_v, i));
                 let torque = Vec3([torque(i), torque(i + 1), torque(i + 2)]);
@@ -140,7 +140,7 @@ impl Workspace {
             if i >= model.dimensions.dynamic {
                 continue;
             }
-            let turn = &self.balls.turns[o];
+            let turn = self.balls.turn(o);
             let momentum = three(&self.mid.l_v, i);
             let torque = three(&self.mid.l_q, i) * (0.5 * h) + three(&self.mid.force, i) * weight;
             let momentum = turn.momentum_to_start(momentum);
@@ -160,7 +160,7 @@ impl Workspace {
             if i >= model.dimensions.dynamic {
                 continue;
             }
-            let turn = &self.balls.turns[o];
+            let turn = self.balls.turn(o);
             let carried = three(&self.mid.l_v, i).cross(turn.xi);
             let force = three(&self.mid.force, i);
             let change = if skew == 0.0 {

@@ -96,10 +96,4 @@ impl Weights {
         column: Mat3::IDENTITY,
         own: Mat3::ZERO,
     };
-
-    /// The maps of rows, of a joint that turns by `ξ`.
-    pub(crate) fn of_rows(turn: &Turn) -> Self {
-        let (momentum, torque) = (turn.momentum_at_start(), turn.torque_at_start());
-        Self { momentum, torque, ..Self::REST }
-    }
 }

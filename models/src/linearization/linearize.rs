@@ -168,7 +168,7 @@ impl SolvedStep {
         }
         if !self.orientations.is_empty() {
             self.orientations.copy_from_slice(&workspace.balls.start);
-            for (to, turn) in self.turns.iter_mut().zip(&workspace.balls.turns) {
+            for (to, turn) in self.turns.iter_mut().zip(workspace.balls.turns()) {
                 *to = turn.xi;
             }
         }

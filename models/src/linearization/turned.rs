@@ -324,7 +324,7 @@ impl Workspace {
         let (model, h, nd) = (at.model, at.settings.time_step_s, at.model.dimensions.dynamic);
         let skew = (2.0 * ends.at_start - 1.0) * h;
         let Self { mid, balls, tangents, .. } = self;
-        let turns = model.orientations.iter().zip(&balls.turns);
+        let turns = model.orientations.iter().zip(balls.turns());
         ends.turnings.clear();
         ends.turnings.extend(turns.map(|(&i, turn)| Turning::new(model, i, turn.xi, h)));
         for (first, joint) in model.dynamics.joints.iter().enumerate() {
@@ -507,7 +507,7 @@ coefficient = 0.03
             blocks.next[..nd].copy_from_slice(&workspace.step.increment);
             blocks.next[nd..].copy_from_slice(&workspace.step.q_end[nd..]);
             for (o, &i) in model.orientations.iter().enumerate() {
-                blocks.next[i..i + 3].copy_from_slice(&workspace.balls.turns[o].xi.0);
+                blocks.next[i..i + 3].copy_from_slice(&workspace.balls.turn(o).xi.0);
             }
             blocks.orientations[0].copy_from_slice(&workspace.balls.start);
             blocks.multipliers.copy_from_slice(&workspace.step.multipliers);

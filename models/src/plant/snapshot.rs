@@ -14,7 +14,7 @@ use crate::integrator::state::PreciseState;
 use crate::plant::facade::Plant;
 
 const MAGIC: &[u8; 8] = b"PLNTSNAP";
-const VERSION: u32 = 6;
+const VERSION: u32 = 7;
 
 /// Everything a plant needs to go on bit for bit.
 #[derive(Clone, Debug, PartialEq)]

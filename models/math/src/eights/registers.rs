@@ -20,7 +20,8 @@ pub(super) struct Low(__m256d);
 
 /// What is done number by number in one register.
 macro_rules! number_by_number {
-    ($numbers:literal, $load:ident, $store:ident, $all:ident, $plus:ident, $minus:ident, $times:ident) => {
+    ($numbers:literal, $load:ident, $store:ident, $all:ident, $plus:ident, $minus:ident, $times:ident,
+     $over:ident, $sqrt:ident) => {
         const ZERO: Self = Self::constant(0.0);
         const ONE: Self = Self::constant(1.0);
         #[inline(always)]
@@ -53,6 +54,16 @@ macro_rules! number_by_number {
             // SAFETY: there are such registers.
             Self(unsafe { $times(self.0, o.0) })
         }
+        #[inline(always)]
+        fn over(self, o: Self) -> Self {
+            // SAFETY: there are such registers.
+            Self(unsafe { $over(self.0, o.0) })
+        }
+        #[inline(always)]
+        fn sqrt(self) -> Self {
+            // SAFETY: there are such registers.
+            Self(unsafe { $sqrt(self.0) })
+        }
     };
 }
 
@@ -83,7 +94,17 @@ impl Whole {
 impl Eight for Whole {
     type Four = Low;
     number_by_number! {
-        8, _mm512_loadu_pd, _mm512_storeu_pd, _mm512_set1_pd, _mm512_add_pd, _mm512_sub_pd, _mm512_mul_pd
+        8, _mm512_loadu_pd, _mm512_storeu_pd, _mm512_set1_pd, _mm512_add_pd, _mm512_sub_pd, _mm512_mul_pd,
+        _mm512_div_pd, _mm512_sqrt_pd
+    }
+    #[inline(always)]
+    fn signed(self, o: Self) -> Self {
+        // SAFETY: there are such registers. Bits of `o` where the mask has some, else its own.
+        Self(unsafe {
+            let (own, other) = (_mm512_castpd_si512(self.0), _mm512_castpd_si512(o.0));
+            let sign = _mm512_set1_epi64(i64::MIN);
+            _mm512_castsi512_pd(_mm512_ternarylogic_epi64::<0xD8>(own, other, sign))
+        })
     }
     #[inline(always)]
     fn transposed([a, b, c, d, e, f, g, h]: [Self; 8]) -> [Self; 8] {
@@ -134,7 +155,16 @@ impl Low {
 impl Eight for Low {
     type Four = Self;
     number_by_number! {
-        4, _mm256_loadu_pd, _mm256_storeu_pd, _mm256_set1_pd, _mm256_add_pd, _mm256_sub_pd, _mm256_mul_pd
+        4, _mm256_loadu_pd, _mm256_storeu_pd, _mm256_set1_pd, _mm256_add_pd, _mm256_sub_pd, _mm256_mul_pd,
+        _mm256_div_pd, _mm256_sqrt_pd
+    }
+    #[inline(always)]
+    fn signed(self, o: Self) -> Self {
+        // SAFETY: there are such registers.
+        Self(unsafe {
+            let sign = _mm256_set1_pd(-0.0);
+            _mm256_or_pd(_mm256_and_pd(sign, o.0), _mm256_andnot_pd(sign, self.0))
+        })
     }
     #[inline(always)]
     fn transposed([a, b, c, d, ..]: [Self; 8]) -> [Self; 8] {
@@ -197,6 +227,18 @@ impl Eight for Halves {
     #[inline(always)]
     fn times(self, o: Self) -> Self {
         Self([self.0[0].times(o.0[0]), self.0[1].times(o.0[1])])
+    }
+    #[inline(always)]
+    fn over(self, o: Self) -> Self {
+        Self([self.0[0].over(o.0[0]), self.0[1].over(o.0[1])])
+    }
+    #[inline(always)]
+    fn sqrt(self) -> Self {
+        Self([self.0[0].sqrt(), self.0[1].sqrt()])
+    }
+    #[inline(always)]
+    fn signed(self, o: Self) -> Self {
+        Self([self.0[0].signed(o.0[0]), self.0[1].signed(o.0[1])])
     }
     #[inline(always)]
     fn sum(self) -> f64 {

@@ -236,24 +236,27 @@ impl<E: Eight, L: Eight> Scalar for Sides<E, L> {
     fn constant(value: f64) -> Self {
         Self::new(E::all(value))
     }
+    #[inline(always)]
     fn value(self) -> f64 {
         self.block().0[0]
     }
     fn sin_cos(self) -> (Self, Self) {
         (self.each(|x| x.sin_cos().0), self.each(|x| x.sin_cos().1))
     }
+    #[inline(always)]
     fn sqrt(self) -> Self {
-        self.each(f64::sqrt)
+        Self::new(self.0.sqrt())
     }
+    #[inline(always)]
     fn recip(self) -> Self {
-        self.each(f64::recip)
+        Self::new(E::ONE.over(self.0))
     }
     fn tanh(self) -> Self {
         self.each(libm::tanh)
     }
-    fn atan2(self, x: Self) -> Self {
-        let (y, x) = (self.block().0, x.block().0);
-        Self::new(E::of(&Block(std::array::from_fn(|i| libm::atan2(y[i], x[i])))))
+    #[inline(always)]
+    fn signed(self, o: Self) -> Self {
+        Self::new(self.0.signed(o.0))
     }
 }
 
@@ -456,6 +459,12 @@ pub(crate) fn in_sides<T: Beside<f64>>(count: usize, task: T) -> T::Output {
     } else {
         in_eights(InEight(task, PhantomData))
     }
+}
+
+/// Does it for one number.
+#[inline(always)]
+pub fn alone<T: Beside<f64>>(task: T) -> T::Output {
+    task.run::<Sides<f64, Block>>()
 }
 
 /// As many as lie in [`Eight::Four`].

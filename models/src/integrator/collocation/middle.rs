@@ -12,8 +12,6 @@
 //! One factorization serves all stages and rounds, and costs O(n) where that of the midpoint rule does.
 
 use plantd_math::dense_inverse::DenseInverse;
-use plantd_math::rotation::Turn;
-use plantd_math::spatial::Vec3;
 
 use crate::integrator::collocation::balls::Balls;
 use crate::integrator::collocation::closures::Closures;
@@ -101,7 +99,7 @@ impl Middle {
         mid.go_to(state, &step.increment, 1.0 / settings.time_step_s);
         if let Some(balls) = balls {
             mid.orientations.copy_from_slice(balls.centers());
-            turning.turns.fill(Turn::new(Vec3::ZERO));
+            turning.stay();
             for &c in &balls.coordinates {
                 step.increment[c..c + 3].fill(0.0);
             }

@@ -1,0 +1,226 @@
+//! The maps of all ball joints of a step, eight side by side.
+
+use plantd_math::rotation::{Quaternion, Turn};
+use plantd_math::rows::Block;
+use plantd_math::scalar::{Beside, Scalar, Wide, alone};
+use plantd_math::sided::{Composite, Sided};
+use plantd_math::spatial::{Mat3, Vec3};
+
+use crate::lagrangian::turning::Weights;
+
+/// As many ball joints stand side by side.
+const BESIDE: usize = <f64 as Scalar>::BESIDE;
+
+/// Does it for all of so many ball joints. A floating base has one: side by side with nothing it would take longer.
+pub(super) fn beside<T: Beside<f64>>(count: usize, task: T) -> T::Output {
+    if count == 1 { alone(task) } else { f64::beside(count, task) }
+}
+
+/// In registers.
+#[inline(always)]
+fn wide<W: Wide<f64>, V: Composite<Block>>(lanes: &V) -> V::Of<W> {
+    lanes.map(|number| W::load(number))
+}
+
+/// In memory.
+#[inline(always)]
+fn put<W: Wide<f64>, V: Composite<Block>>(wide: V::Of<W>, lanes: &mut V) {
+    lanes.zip(wide, |to, number| number.store(to));
+}
+
+/// The matrices of so many ball joints.
+#[inline(always)]
+fn each<W: Wide<f64>>(wide: &Mat3<W>, count: usize, mut take: impl FnMut(usize, Mat3)) {
+    if count == 1 {
+        return take(0, wide.map(|number| number.value()));
+    }
+    let mut lanes = Mat3([Vec3::<Block>::default(); 3]);
+    put(*wide, &mut lanes);
+    for lane in 0..count {
+        take(lane, lanes.map(|block| block.0[lane]));
+    }
+}
+
+/// Components of a list, by their first coordinates. Where it does not reach, as of what is prescribed, they are others.
+#[inline(always)]
+fn collect<W: Wide<f64>>(coordinates: &[usize], list: &[f64], mut others: Vec3<Block>) -> Vec3<W> {
+    let numbers = |i: usize| list.get(i..i + 3);
+    if let [one] = coordinates {
+        // Nothing to be put together.
+        return match numbers(*one) {
+            Some(numbers) => Vec3(one_of([numbers[0], numbers[1], numbers[2]])),
+            None => wide::<W, _>(&others),
+        };
+    }
+    for (lane, &i) in coordinates.iter().enumerate() {
+        if let Some(numbers) = numbers(i) {
+            (0..3).for_each(|k| others.0[k].0[lane] = numbers[k]);
+        }
+    }
+    wide::<W, _>(&others)
+}
+
+/// The way back.
+#[inline(always)]
+fn scatter(coordinates: &[usize], lanes: &Vec3<Block>, list: &mut [f64]) {
+    for (lane, &i) in coordinates.iter().enumerate() {
+        if let Some(numbers) = list.get_mut(i..i + 3) {
+            (0..3).for_each(|k| numbers[k] = lanes.0[k].0[lane]);
+        }
+    }
+}
+
+/// The same numbers in all lanes.
+#[inline(always)]
+fn one_of<W: Wide<f64>, const N: usize>(numbers: [f64; N]) -> [W; N] {
+    let mut all = [W::ZERO; N];
+    for (own, number) in all.iter_mut().zip(&numbers) {
+        *own = W::of_one(number);
+    }
+    all
+}
+
+/// Four numbers of each.
+#[inline(always)]
+fn fours<W: Wide<f64>, T>(list: &[T], of: impl Fn(&T) -> [f64; 4]) -> [W; 4] {
+    if let [one] = list {
+        return one_of(of(one));
+    }
+    let mut lanes = [Block::ZERO; 4];
+    for (lane, own) in list.iter().enumerate() {
+        let four = of(own);
+        (0..4).for_each(|k| lanes[k].0[lane] = four[k]);
+    }
+    let [a, b, c, d] = &lanes;
+    [W::load(a), W::load(b), W::load(c), W::load(d)]
+}
+
+/// The way back.
+#[inline(always)]
+fn in_memory<W: Wide<f64>>(numbers: [W; 4]) -> [Block; 4] {
+    let mut lanes = [Block::ZERO; 4];
+    for (to, number) in lanes.iter_mut().zip(numbers) {
+        number.store(to);
+    }
+    lanes
+}
+
+/// Orientations as matrices, each by itself and side by side.
+pub(super) struct ToMatrices<'a> {
+    pub(super) orientations: &'a [Quaternion],
+    pub(super) matrices: &'a mut [Mat3],
+    pub(super) beside: &'a mut Sided<Mat3<Block>>,
+}
+
+impl Beside<f64> for ToMatrices<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<W: Wide<f64>>(self) {
+        let Self { orientations, matrices, beside } = self;
+        let ends = matrices.chunks_mut(BESIDE).zip(&mut beside.0);
+        for (orientations, (matrices, beside)) in orientations.chunks(BESIDE).zip(ends) {
+            let orientation = Quaternion(fours::<W, _>(orientations, |q| q.0));
+            let all = orientation.matrix();
+            put(all, beside);
+            each(&all, matrices.len(), |lane, matrix| matrices[lane] = matrix);
+        }
+    }
+}
+
+/// Turns by `ξ`, and orientations in the middle of them. What is prescribed keeps its turn.
+pub(super) struct ToMidpoint<'a> {
+    pub(super) coordinates: &'a [usize],
+    /// `ξ`, in the place of dynamic coordinates.
+    pub(super) increment: &'a [f64],
+    pub(super) start: &'a Sided<Mat3<Block>>,
+    pub(super) turns: &'a mut Sided<Turn<Block>>,
+    pub(super) middle: &'a mut [Mat3],
+}
+
+impl Beside<f64> for ToMidpoint<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<W: Wide<f64>>(self) {
+        let Self { coordinates, increment, start, turns, middle } = self;
+        let ends = start.0.iter().zip(middle.chunks_mut(BESIDE));
+        let groups = coordinates.chunks(BESIDE).zip(&mut turns.0);
+        for ((coordinates, turn), (start, middle)) in groups.zip(ends) {
+            let own = Turn::new(collect::<W>(coordinates, increment, turn.xi));
+            put(own, turn);
+            let all = wide::<W, _>(start).times(&own.half());
+            each(&all, middle.len(), |lane, matrix| middle[lane] = matrix);
+        }
+    }
+}
+
+/// Weights of rows and columns.
+pub(super) struct Weigh<'a> {
+    pub(super) coordinates: &'a [usize],
+    pub(super) turns: &'a Sided<Turn<Block>>,
+    pub(super) momentum: &'a [f64],
+    /// `L_q` and forces, which count `half` and `weight` in an impulse.
+    pub(super) torque: &'a [f64],
+    pub(super) force: &'a [f64],
+    pub(super) half: f64,
+    pub(super) weight: f64,
+    pub(super) weights: &'a mut [Weights],
+}
+
+impl Beside<f64> for Weigh<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<W: Wide<f64>>(self) {
+        let Self { coordinates, turns, momentum, torque, force, half, weight, weights } = self;
+        let groups = coordinates.chunks(BESIDE).zip(&turns.0);
+        for ((coordinates, turn), weights) in groups.zip(weights.chunks_mut(BESIDE)) {
+            let turn: Turn<W> = wide::<W, _>(turn);
+            let of = |list: &[f64]| collect::<W>(coordinates, list, Vec3::default());
+            let (momentum, torque, force) = (of(momentum), of(torque), of(force));
+            let changes = turn.changes();
+            let impulse = torque.scaled(half) + force.scaled(weight);
+            let own = changes.of_torque(impulse).minus(&changes.of_momentum(momentum));
+            let count = coordinates.len();
+            each(&own, count, |lane, matrix| weights[lane].own = matrix);
+            each(&turn.momentum_at_start(), count, |lane, matrix| weights[lane].momentum = matrix);
+            each(&turn.torque_at_start(), count, |lane, matrix| weights[lane].torque = matrix);
+            each(&turn.dexp_of_half(), count, |lane, matrix| weights[lane].column = matrix);
+        }
+    }
+}
+
+/// Turns orientations by `ξ`, with what rounding took from them, and writes their rotation vectors.
+pub(super) struct TurnOn<'a> {
+    pub(super) coordinates: &'a [usize],
+    /// `ξ`, in the place of dynamic coordinates; what is prescribed does not turn.
+    pub(super) increment: &'a [f64],
+    pub(super) orientations: &'a mut [Quaternion],
+    pub(super) low: &'a mut [[f64; 4]],
+    /// Dynamic coordinates.
+    pub(super) q: &'a mut [f64],
+}
+
+impl Beside<f64> for TurnOn<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<W: Wide<f64>>(self) {
+        let Self { coordinates, increment, orientations, low, q } = self;
+        let ends = orientations.chunks_mut(BESIDE).zip(low.chunks_mut(BESIDE));
+        for (coordinates, (orientations, low)) in coordinates.chunks(BESIDE).zip(ends) {
+            let turn = collect::<W>(coordinates, increment, Vec3::default());
+            let start = Quaternion(fours::<W, _>(orientations, |q| q.0));
+            let (end, end_low) = start.turned(fours::<W, _>(low, |low| *low), turn);
+            let mut vectors = Vec3::<Block>::default();
+            put(end.log(), &mut vectors);
+            let (end, end_low) = (in_memory(end.0), in_memory(end_low));
+            for (lane, (orientation, low)) in orientations.iter_mut().zip(low).enumerate() {
+                (0..4).for_each(|k| orientation.0[k] = end[k].0[lane]);
+                (0..4).for_each(|k| low[k] = end_low[k].0[lane]);
+            }
+            scatter(coordinates, &vectors, q);
+        }
+    }
+}
