@@ -4,7 +4,7 @@
 //! derivatives of these along a direction. Steps and the first-order linearization itself, which is
 //! [`linearize`](crate::linearization::linearize), know the sparsity.
 
-use plantd_math::rotation;
+use plantd_math::rotation::{self, Turn};
 use plantd_math::scalar::{Dual, Scalar};
 use plantd_math::spatial::{Mat3, Vec3, three};
 
@@ -146,7 +146,7 @@ impl<S: Scalar> StepBlocks<S> {
             let start = self.orientations[0][o];
             self.orientations[1][o] = start.times(&rotation::exp(turn.scaled(0.5)));
             self.orientations[2][o] = start.times(&rotation::exp(turn));
-            self.turnings.push(Turning::new(model, i, turn, h));
+            self.turnings.push(Turning::new(model, i, Turn::new(turn), h));
         }
     }
 

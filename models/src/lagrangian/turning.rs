@@ -1,6 +1,6 @@
 //! The maps by which a ball joint weighs the derivatives of a step; see [`plantd_math::rotation`].
 
-use plantd_math::rotation::{self, Turn};
+use plantd_math::rotation::{self, Chart, Turn};
 use plantd_math::scalar::Scalar;
 use plantd_math::spatial::{Mat3, Vec3};
 
@@ -28,10 +28,9 @@ pub(crate) struct Turning<S = f64> {
 }
 
 impl<S: Scalar> Turning<S> {
-    pub(crate) fn new(model: &Model, coordinate: usize, turn: Vec3<S>, time_step_s: f64) -> Self {
+    pub(crate) fn new(model: &Model, coordinate: usize, turn: Turn<S>, time_step_s: f64) -> Self {
         let rate = S::constant(1.0 / time_step_s);
-        let whole = turn;
-        let turn = Turn::new(whole);
+        let whole = Chart::new(turn.xi);
         let middle = turn.dexp_of_half().scaled(S::constant(0.5));
         let start = turn.half().transpose();
         let momentum = turn.momentum_at_start();
@@ -51,8 +50,8 @@ impl<S: Scalar> Turning<S> {
             turn,
             momentum,
             torque: turn.torque_at_start(),
-            to_end: rotation::dexp(whole),
-            carried: rotation::exp(-whole),
+            to_end: whole.dexp(),
+            carried: whole.exp().transpose(),
             by_start,
             by_next,
         }

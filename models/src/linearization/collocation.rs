@@ -17,6 +17,7 @@
 //! Costs O((s n)³) for `s` stages of `n` dynamic coordinates.
 
 use plantd_math::rows::{add_product, add_rows};
+use plantd_math::rotation::Turn;
 use plantd_math::spatial::{Mat3, three};
 
 use crate::integrator::collocation::Collocation;
@@ -116,7 +117,7 @@ impl Collocation {
         let turned = system.slopes.as_deref();
         for &c in &model.orientations {
             let turn = three(&workspace.step.increment, c);
-            out.ends.turnings.push(Turning::new(model, c, turn, h));
+            out.ends.turnings.push(Turning::new(model, c, Turn::new(turn), h));
         }
         let [mut increment, mut moved] = [0; 2].map(|_| vec![0.0; stride]);
         for a in 0..nd {

@@ -326,7 +326,7 @@ impl Workspace {
         let Self { mid, balls, tangents, .. } = self;
         let turns = model.orientations.iter().zip(balls.turns());
         ends.turnings.clear();
-        ends.turnings.extend(turns.map(|(&i, turn)| Turning::new(model, i, turn.xi, h)));
+        ends.turnings.extend(turns.map(|(&i, turn)| Turning::new(model, i, turn, h)));
         for (first, joint) in model.dynamics.joints.iter().enumerate() {
             let i = joint.coordinate;
             if joint.kind != JointKind::Ball(0) || i >= nd {
