@@ -16,7 +16,9 @@ use crate::integrator::foresight::{Strayed, is_negligible};
 use crate::integrator::midpoint::{Midpoint, middle};
 use crate::integrator::newton::{CONVERGED, Chord, STALE, is_round_off};
 use crate::integrator::point::{Parts, Point};
-use crate::integrator::predictor::{LENGTH, best_order, difference};
+use crate::integrator::predictor::{
+    FEW, LENGTH, best_order, differences_of, known_after, most_known, seen,
+};
 use crate::integrator::push::weigh;
 use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::residual::sum_of;
@@ -43,6 +45,8 @@ pub(crate) struct Abreast<const N: usize> {
     impulse: Vec<LanesOf<N>>,
     /// What lanes have come to that are done.
     solved: [Vec<LanesOf<N>>; 2],
+    /// How many evaluations that took.
+    evaluations: LanesOf<N>,
     systems: Systems<N>,
     diagonal: Vec<LanesOf<N>>,
     nudge: Nudge<LanesOf<N>>,
@@ -307,6 +311,7 @@ impl<const N: usize> Abreast<N> {
             increment: zeros(),
             impulse: zeros(),
             solved: [zeros(), zeros()],
+            evaluations: LanesOf::ZERO,
             systems: Systems {
                 first: system(),
                 later: system(),
@@ -356,12 +361,11 @@ impl<const N: usize> Abreast<N> {
     fn predict(&mut self, state: &States<N>) {
         let States { past, order, .. } = state;
         let most = order.0.into_iter().fold(1.0, f64::max) as usize;
-        let is_taken: [Truths<N>; LENGTH] =
-            std::array::from_fn(|m| LanesOf::constant(m as f64).less(*order));
         for (increment, differences) in self.increment.iter_mut().zip(past) {
             let mut sum = differences[0];
-            for (difference, is_taken) in differences.iter().zip(&is_taken).take(most).skip(1) {
-                sum = LanesOf::choose(*is_taken, sum + *difference, sum);
+            for (m, difference) in differences.iter().enumerate().take(most).skip(1) {
+                let is_taken = LanesOf::constant(m as f64).less(*order);
+                sum = LanesOf::choose(is_taken, sum + *difference, sum);
             }
             *increment = sum;
         }
@@ -505,9 +509,11 @@ impl<const N: usize> Abreast<N> {
         let foresees = model.is_foreseen(settings);
         let mut strayed = Strayed::<LanesOf<N>>::default();
         let (mut live, mut done) = (lanes, LanesOf::<N>::all(false));
+        self.evaluations = LanesOf::ZERO;
         let (mut factorizations, mut iterations) = (LanesOf::<N>::ZERO, 0);
         while LanesOf::<N>::any(live) && iterations < settings.max_iterations {
             iterations += 1;
+            self.evaluations = LanesOf::choose(live, self.evaluations + 1.0, self.evaluations);
             let size = self.evaluate(model, settings, state);
             live = live & size.less(constant(f64::INFINITY));
             let converged = chord.judge(size, LanesOf::ZERO);
@@ -593,26 +599,24 @@ impl<const N: usize> Abreast<N> {
     #[inline(never)]
     pub(crate) fn move_on(&mut self, model: &Model, state: &mut States<N>) {
         in_registers!(LanesOf<N>, {
-            let Self { solved: [increment, impulse], push, systems, .. } = self;
+            let Self { solved: [increment, impulse], evaluations, push, systems, .. } = self;
             let States { q, q_low, p, p_low, past, known, order, last } = state;
             add(q, q_low, increment);
             add(p, p_low, impulse);
-            let rows = past.iter_mut().zip(&*increment).zip(&model.conditioning.inertia);
-            let errors = match push {
-                None => {
-                    difference(rows.map(|((row, x), weight)| (row, *x, LanesOf::ZERO, *weight)))
-                }
-                Some(push) => {
-                    let rows = rows.zip(&push.pushed);
-                    difference(rows.map(|(((row, x), weight), push)| (row, *x, *push, *weight)))
-                }
+            let most = most_known(*known, *evaluations);
+            let seen = seen(*known, most);
+            let inertia = &model.conditioning.inertia[..];
+            let pushed = push.as_ref().map_or(&[][..], |push| &push.pushed);
+            let few = LanesOf::constant(FEW as f64);
+            // How many are gone through is the same in all lanes, and a constant.
+            *order = if LanesOf::<N>::any(few.at_most(seen)) {
+                let errors = differences_of::<LENGTH, _>(past, increment, inertia, pushed);
+                best_order(&errors, seen, LENGTH - 1)
+            } else {
+                let errors = differences_of::<FEW, _>(past, increment, inertia, pushed);
+                best_order(&errors, seen, FEW - 1)
             };
-            let most = LENGTH - 1;
-            let seen = known.max(LanesOf::ONE);
-            *order = best_order(&errors, seen, most);
-            let next = *known + 1.0;
-            let longest = LanesOf::constant(LENGTH as f64);
-            *known = LanesOf::choose(next.less(longest), next, longest);
+            *known = known_after(*known, *order, most);
             if let (Some(push), Some(last)) = (push, last) {
                 std::mem::swap(&mut last.points, &mut push.points);
                 std::mem::swap(&mut last.factors, &mut systems.first);

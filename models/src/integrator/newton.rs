@@ -113,7 +113,13 @@ impl Workspace {
     /// Solves one step; the solution stays in the workspace.
     #[inline]
     pub(crate) fn solve(&mut self, at: StepContext<'_>) -> Result<StepReport, StepError> {
-        if at.model.is_of_bodies() { self.solve_as::<true>(at) } else { self.solve_as::<false>(at) }
+        let report = if at.model.is_of_bodies() {
+            self.solve_as::<true>(at)
+        } else {
+            self.solve_as::<false>(at)
+        };
+        self.step.evaluations = report.as_ref().map_or(0, |report| report.iterations);
+        report
     }
 
     /// `BODIES`: whether the model is one of bodies ([`Model::is_of_bodies`]). All others have no push and no end

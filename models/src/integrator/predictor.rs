@@ -4,7 +4,8 @@
 //! differences `∇⁰x[k] = x[k]`, `∇ʲ⁺¹x[k] = ∇ʲx[k] − ∇ʲx[k−1]`. What such a prediction is off by is the
 //! difference `∇ᵐx[k+1]`: the differences of an increment tell how good each order has been, and the next
 //! step takes the best. A smooth motion is predicted to many digits, and one that is pushed around is not
-//! extrapolated far.
+//! extrapolated far. Eight differences are kept, and more where steps take more than one evaluation and these would make
+//! better guesses: what is foretold by less does not pay for them.
 //!
 //! What a change of the inputs does to an increment is no part of the differences from `∇²` on, and is guessed by
 //! itself ([`push`](super::push)).
@@ -21,9 +22,10 @@ use crate::model::mechanism::Model;
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Past {
     kind: Kind,
-    /// Increments: `∇⁰x … ∇⁷x` of each coordinate. Stages: their velocities, stage by stage, then forces.
+    /// Increments: `∇⁰x, ∇¹x, …` of each coordinate. Stages: their velocities, stage by stage, then forces.
     numbers: Vec<f64>,
-    /// Steps seen, up to [`LENGTH`]; of stages 1. Without any there is nothing to guess from.
+    /// Increments: differences that are known, up to [`LENGTH`], one more for each step seen at most; others mean
+    /// nothing. Of stages 1. Without any there is nothing to guess from.
     known: u8,
     /// Differences that the next prediction by increments takes.
     order: u8,
@@ -41,19 +43,41 @@ enum Kind {
     Stages(u8),
 }
 
-/// Steps kept.
+/// Differences kept, at most.
 pub(crate) const LENGTH: usize = 12;
 
-/// Takes new increments into the differences of past ones, those from `∇²` on less what was pushed, and sums up
-/// their squares, weighed.
+/// Differences beyond the best that are kept, where more than [`FEW`] are: one may be worse, and the next one better.
+const BEYOND: f64 = 2.0;
+
+/// As many differences suffice where one evaluation a step does.
+pub(crate) const FEW: usize = 8;
+
+/// Takes new increments into `COUNT` differences of past ones, those from `∇²` on less what was pushed, if anything was,
+/// and sums up their squares, weighed.
 #[inline(always)]
-pub(crate) fn difference<'a, S: Scalar>(
+pub(crate) fn differences_of<const COUNT: usize, S: Scalar>(
+    rows: &mut [[S; LENGTH]],
+    increments: &[S],
+    inertia: &[f64],
+    pushed: &[S],
+) -> [S; LENGTH] {
+    let rows = rows.iter_mut().zip(increments).zip(inertia);
+    if pushed.is_empty() {
+        difference::<COUNT, S>(rows.map(|((row, x), weight)| (row, *x, S::ZERO, *weight)))
+    } else {
+        let rows = rows.zip(pushed);
+        difference::<COUNT, S>(rows.map(|(((row, x), weight), push)| (row, *x, *push, *weight)))
+    }
+}
+
+#[inline(always)]
+fn difference<'a, const COUNT: usize, S: Scalar>(
     rows: impl Iterator<Item = (&'a mut [S; LENGTH], S, S, f64)>,
 ) -> [S; LENGTH] {
     let mut errors = [S::ZERO; LENGTH];
     for (differences, increment, pushed, weight) in rows {
         let mut difference = increment;
-        for (m, (kept, error)) in differences.iter_mut().zip(&mut errors).enumerate() {
+        for (m, (kept, error)) in differences[..COUNT].iter_mut().zip(&mut errors).enumerate() {
             if m == 2 {
                 difference -= pushed;
             }
@@ -79,6 +103,30 @@ pub(crate) fn best_order<S: Compared>(errors: &[S; LENGTH], known: S, most: usiz
         order = S::choose(is_better, place, order);
     }
     order
+}
+
+#[inline(always)]
+fn least<S: Compared>(a: S, b: S) -> S {
+    S::choose(a.less(b), a, b)
+}
+
+/// How many differences may be known after a step, by those that were and how often the equations were evaluated.
+#[inline(always)]
+pub(crate) fn most_known<S: Compared>(known: S, evaluations: S) -> S {
+    let [one, few, all] = [1.0, FEW as f64, LENGTH as f64].map(S::constant);
+    S::choose(one.less(evaluations), all, known.max(few))
+}
+
+/// Of the differences of a new increment, those of lower order than this and one more mean something.
+#[inline(always)]
+pub(crate) fn seen<S: Compared>(known: S, most: S) -> S {
+    least(known, most - 1.0).max(S::ONE)
+}
+
+/// Differences that are known after a step, of which the next one takes so many.
+#[inline(always)]
+pub(crate) fn known_after<S: Compared>(known: S, order: S, most: S) -> S {
+    least(least(known + 1.0, (order + BEYOND).max(S::constant(FEW as f64))), most)
 }
 
 impl Past {
@@ -158,22 +206,28 @@ impl Past {
     /// Takes note of a step. The error of all coordinates is weighed by their `inertia`; `pushed`, if it is not empty,
     /// is what was guessed of the change of the inputs.
     #[inline(never)]
-    pub(crate) fn record(&mut self, increments: &[f64], inertia: &[f64], pushed: &[f64]) {
+    pub(crate) fn record(
+        &mut self,
+        increments: &[f64],
+        inertia: &[f64],
+        pushed: &[f64],
+        evaluations: u32,
+    ) {
         if self.kind != Kind::Increments {
             return;
         }
+        let known = f64::from(self.known);
+        let most = most_known(known, f64::from(evaluations));
+        let seen = seen(known, most);
         let rows = self.numbers.as_chunks_mut::<LENGTH>().0;
-        let rows = rows.iter_mut().zip(increments).zip(inertia);
-        let errors = if pushed.is_empty() {
-            difference(rows.map(|((row, x), weight)| (row, *x, 0.0, *weight)))
+        let errors = if seen < FEW as f64 {
+            differences_of::<FEW, _>(rows, increments, inertia, pushed)
         } else {
-            let rows = rows.zip(pushed);
-            difference(rows.map(|(((row, x), weight), push)| (row, *x, *push, *weight)))
+            differences_of::<LENGTH, _>(rows, increments, inertia, pushed)
         };
-        // Of the differences, as many mean something as there were increments before.
-        let known = usize::from(self.known).clamp(1, LENGTH - 1);
-        self.order = best_order(&errors, known as f64, known) as u8;
-        self.known = (self.known + 1).min(LENGTH as u8);
+        let order = best_order(&errors, seen, seen as usize);
+        self.known = known_after(known, order, most) as u8;
+        self.order = order as u8;
     }
 
     /// Takes note of the velocities and forces at the stages of a step.
@@ -268,6 +322,15 @@ impl Past {
         (self.kind, self.known, self.order, self.is_even) = (kind, known, order, is_even);
     }
 
+    /// Takes the differences that mean nothing for zero: then pasts that are the same have the same numbers.
+    pub(crate) fn tidy(&mut self) {
+        if self.kind == Kind::Increments {
+            for differences in self.numbers.as_chunks_mut::<LENGTH>().0 {
+                differences[usize::from(self.known)..].fill(0.0);
+            }
+        }
+    }
+
     /// All numbers that it keeps.
     pub(crate) fn numbers(&mut self) -> impl Iterator<Item = &mut f64> {
         self.numbers.iter_mut().chain(&mut self.point.numbers)
@@ -285,7 +348,7 @@ mod tests {
             let mut predicted = [0.0];
             predictor.predict(&mut predicted);
             let order = predictor.order;
-            predictor.record(&[motion(k as f64)], &[1.0], &[]);
+            predictor.record(&[motion(k as f64)], &[1.0], &[], 2);
             (predicted[0], motion(k as f64), order)
         };
         (0..steps).map(step).collect()

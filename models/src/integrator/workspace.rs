@@ -54,6 +54,8 @@ pub(crate) struct StepIncrement {
     pub(crate) q_end: Vec<f64>,
     /// Whether the last evaluation was at the increment.
     pub(crate) is_evaluated: bool,
+    /// How many evaluations the solution took.
+    pub(crate) evaluations: u32,
 }
 
 /// What a step's equations leave over; a correction takes its place.
@@ -147,6 +149,7 @@ impl Workspace {
                 impulse: zeros(nd),
                 q_end: zeros(n),
                 is_evaluated: false,
+                evaluations: 0,
             },
             mid: Midpoint::new(model),
             balls: BallJoints::new(model),

@@ -16,8 +16,8 @@
 //!
 //! Costs O((s n)³) for `s` stages of `n` dynamic coordinates.
 
-use plantd_math::rows::{add_product, add_rows};
 use plantd_math::rotation::Turn;
+use plantd_math::rows::{add_product, add_rows};
 use plantd_math::spatial::{Mat3, three};
 
 use crate::integrator::collocation::Collocation;

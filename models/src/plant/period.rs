@@ -13,7 +13,7 @@ use crate::integrator::report::StepError;
 use crate::integrator::response::Response;
 use crate::integrator::scheme::Scheme;
 use crate::integrator::state::{PreciseState, add};
-use crate::integrator::workspace::Workspace;
+use crate::integrator::workspace::{StepIncrement, Workspace};
 use crate::linearization::chain::Chain;
 use crate::model::mechanism::Model;
 use crate::model::signal::Target;
@@ -168,7 +168,8 @@ impl PreciseState {
             None => {
                 let inertia = &model.conditioning.inertia;
                 let Response { pushed, point, .. } = &workspace.response;
-                self.past.record(&workspace.step.increment, inertia, pushed);
+                let StepIncrement { increment, evaluations, .. } = &workspace.step;
+                self.past.record(increment, inertia, pushed, *evaluations);
                 self.past.point.follow(point);
             }
         }

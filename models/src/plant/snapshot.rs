@@ -38,11 +38,9 @@ pub enum SnapshotError {
 impl Plant {
     /// Takes a snapshot.
     pub fn snapshot(&self) -> Snapshot {
-        Snapshot {
-            model_digest: self.model.digest(),
-            settings: self.settings,
-            state: self.state.clone(),
-        }
+        let mut state = self.state.clone();
+        state.past.tidy();
+        Snapshot { model_digest: self.model.digest(), settings: self.settings, state }
     }
 
     /// Restores a snapshot of a plant of the same model and settings, step count included.
