@@ -704,6 +704,30 @@ mod tests {
         }
     }
 
+    /// Rotations side by side are to the bit what each is by itself.
+    #[test]
+    fn side_by_side_is_each_by_itself() {
+        use crate::scalar::LanesOf;
+        let all: Vec<Vec3> = vectors().collect();
+        let lanes = |k: usize| LanesOf::<8>(std::array::from_fn(|lane| all[lane].0[k]));
+        let start = Quaternion::exp(Vec3([0.3, 0.7, -0.2]));
+        let low = [1e-17, -2e-17, 3e-17, 0.0];
+        let turn = Vec3([lanes(0), lanes(1), lanes(2)]);
+        let wide = Quaternion(start.0.map(LanesOf::constant));
+        let (end, end_low) = wide.turned(low.map(LanesOf::constant), turn);
+        let (log, matrix) = (end.log(), end.matrix());
+        let changes = Turn::new(turn);
+        let changes = changes.changes().of_momentum(log);
+        for (lane, &xi) in all.iter().enumerate() {
+            let (own, own_low) = start.turned(low, xi);
+            assert_eq!((own.0, own_low), (end.0.map(|c| c.0[lane]), end_low.map(|c| c.0[lane])));
+            assert_eq!(own.log(), log.map(|c| c.0[lane]));
+            assert_eq!(own.matrix(), matrix.map(|c| c.0[lane]));
+            let own = Turn::new(xi).changes().of_momentum(own.log());
+            assert_eq!(own, changes.map(|c| c.0[lane]));
+        }
+    }
+
     /// The maps of a chart are those of rotation vectors, and their slopes what dual numbers say.
     #[test]
     fn charts_and_their_slopes() {
