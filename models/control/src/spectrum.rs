@@ -9,6 +9,9 @@ use crate::error::RiccatiError;
 const SWEEPS_PER_EIGENVALUE: usize = 60;
 
 /// Eigenvalues of a square matrix, about `25n³` flops.
+///
+/// The sweeps have no exceptional shifts, and of few matrices, such as maps with several eigenvalues 1, they go round in
+/// circles by their round-off. Others with the same eigenvalues do not: the transpose, and what a reflection makes of both.
 pub(super) fn eigenvalues(m: &DMatrix<f64>) -> Result<Vec<Complex<f64>>, RiccatiError> {
     let size = m.nrows();
     if size == 0 {
@@ -17,9 +20,26 @@ pub(super) fn eigenvalues(m: &DMatrix<f64>) -> Result<Vec<Complex<f64>>, Riccati
     // Balancing keeps the small eigenvalues of badly scaled states out of the large ones' round-off.
     let mut balanced = m.clone();
     balancing::balance_parlett_reinsch(&mut balanced);
-    Schur::try_new(balanced, f64::EPSILON, SWEEPS_PER_EIGENVALUE * size)
-        .map(|schur| schur.complex_eigenvalues().iter().copied().collect())
+    let found = |m: DMatrix<f64>| {
+        let schur = Schur::try_new(m, f64::EPSILON, SWEEPS_PER_EIGENVALUE * size)?;
+        Some(schur.complex_eigenvalues().iter().copied().collect())
+    };
+    let transposed = balanced.transpose();
+    found(balanced.clone())
+        .or_else(|| found(transposed.clone()))
+        .or_else(|| found(reflected(balanced)))
+        .or_else(|| found(reflected(transposed)))
         .ok_or(RiccatiError::Eigenvalues { size })
+}
+
+/// `Q M Q` with a reflection `Q` along a vector that has nothing to do with `M`.
+fn reflected(mut m: DMatrix<f64>) -> DMatrix<f64> {
+    let along = DVector::from_fn(m.nrows(), |i, _| 1.0 / (i as f64 + 1.5)).normalize();
+    let rows = m.transpose() * &along;
+    m.ger(-2.0, &along, &rows, 1.0);
+    let columns = &m * &along;
+    m.ger(-2.0, &columns, &along, 1.0);
+    m
 }
 
 /// Largest modulus of the eigenvalues of a square, finite matrix.
@@ -46,4 +66,33 @@ pub(super) fn balance(a: &mut DMatrix<f64>, b: &mut DMatrix<f64>) -> DVector<f64
         row /= *scale;
     }
     scales
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Of cyclic permutations sweeps without exceptional shifts get nowhere; of free bodies all eigenvalues are 1.
+    #[test]
+    fn sweeps_that_go_round_in_circles_are_begun_elsewhere() {
+        for n in 1..12 {
+            let cycle = DMatrix::from_fn(n, n, |i, j| if (j + 1) % n == i { 1.0 } else { 0.0 });
+            let mut found = eigenvalues(&cycle).unwrap();
+            found.sort_by(|a, b| a.arg().total_cmp(&b.arg()));
+            assert_eq!(found.len(), n);
+            for z in found {
+                assert!((z.powu(n as u32) - 1.0).norm() < 1e-12, "{n}: {z}");
+            }
+            let free =
+                DMatrix::from_fn(2 * n, 2 * n, |i, j| if i == j || j == i + n { 1.0 } else { 0.0 });
+            assert!(eigenvalues(&free).unwrap().iter().all(|z| (z - 1.0).norm() < 1e-6), "{n}");
+        }
+    }
+
+    #[test]
+    fn reflections_keep_eigenvalues() {
+        let m = DMatrix::from_fn(6, 6, |i, j| (1.3 * i as f64 + 0.7 * (j * j) as f64).sin());
+        let [a, b] = [m.clone(), reflected(m)].map(|m| sorted(eigenvalues(&m).unwrap()));
+        assert!(a.iter().zip(&b).all(|(a, b)| (a - b).norm() < 1e-13), "{a:?} {b:?}");
+    }
 }

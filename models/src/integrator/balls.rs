@@ -13,8 +13,6 @@
 //! a whole turn in one step. In the Newton matrix the maps weigh rows and columns of the joint: see
 //! [`crate::lagrangian::generators`]. See [`plantd_math::rotation`] for the maps.
 
-mod maps;
-
 use plantd_math::eights::{Eight, InEights, in_eights};
 use plantd_math::rotation;
 use plantd_math::rotation::{Quaternion, Turn};
@@ -24,7 +22,7 @@ use plantd_math::sided::Sided;
 use plantd_math::spatial::{Mat3, Vec3, three};
 use plantd_math::tree_lu::TreeLu;
 
-use crate::integrator::balls::maps::{ToMatrices, ToMidpoint, TurnOn, Weigh, beside};
+use crate::integrator::ball_maps::{ToMatrices, ToMidpoint, TurnOn, Weigh, beside};
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::{Tangents, Workspace};

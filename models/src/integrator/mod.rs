@@ -6,6 +6,7 @@
 //! [`scheme`] has the coefficients. [`abreast`] takes steps of several plants side by side.
 
 pub(crate) mod abreast;
+pub(crate) mod ball_maps;
 pub(crate) mod balls;
 pub(crate) mod blocks;
 pub(crate) mod collocation;

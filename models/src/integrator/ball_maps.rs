@@ -12,7 +12,7 @@ use crate::lagrangian::turning::Weights;
 const BESIDE: usize = <f64 as Scalar>::BESIDE;
 
 /// Does it for all of so many ball joints. A floating base has one: side by side with nothing it would take longer.
-pub(super) fn beside<T: Beside<f64>>(count: usize, task: T) -> T::Output {
+pub(crate) fn beside<T: Beside<f64>>(count: usize, task: T) -> T::Output {
     if count == 1 { alone(task) } else { f64::beside(count, task) }
 }
 
@@ -28,7 +28,7 @@ fn put<W: Wide<f64>, V: Composite<Block>>(wide: V::Of<W>, lanes: &mut V) {
     lanes.zip(wide, |to, number| number.store(to));
 }
 
-/// The matrices of so many ball joints.
+/// Gives the matrices of so many ball joints, one after the other.
 #[inline(always)]
 fn each<W: Wide<f64>>(wide: &Mat3<W>, count: usize, mut take: impl FnMut(usize, Mat3)) {
     if count == 1 {
@@ -106,10 +106,10 @@ fn in_memory<W: Wide<f64>>(numbers: [W; 4]) -> [Block; 4] {
 }
 
 /// Orientations as matrices, each by itself and side by side.
-pub(super) struct ToMatrices<'a> {
-    pub(super) orientations: &'a [Quaternion],
-    pub(super) matrices: &'a mut [Mat3],
-    pub(super) beside: &'a mut Sided<Mat3<Block>>,
+pub(crate) struct ToMatrices<'a> {
+    pub(crate) orientations: &'a [Quaternion],
+    pub(crate) matrices: &'a mut [Mat3],
+    pub(crate) beside: &'a mut Sided<Mat3<Block>>,
 }
 
 impl Beside<f64> for ToMatrices<'_> {
@@ -129,13 +129,13 @@ impl Beside<f64> for ToMatrices<'_> {
 }
 
 /// Turns by `ξ`, and orientations in the middle of them. What is prescribed keeps its turn.
-pub(super) struct ToMidpoint<'a> {
-    pub(super) coordinates: &'a [usize],
+pub(crate) struct ToMidpoint<'a> {
+    pub(crate) coordinates: &'a [usize],
     /// `ξ`, in the place of dynamic coordinates.
-    pub(super) increment: &'a [f64],
-    pub(super) start: &'a Sided<Mat3<Block>>,
-    pub(super) turns: &'a mut Sided<Turn<Block>>,
-    pub(super) middle: &'a mut [Mat3],
+    pub(crate) increment: &'a [f64],
+    pub(crate) start: &'a Sided<Mat3<Block>>,
+    pub(crate) turns: &'a mut Sided<Turn<Block>>,
+    pub(crate) middle: &'a mut [Mat3],
 }
 
 impl Beside<f64> for ToMidpoint<'_> {
@@ -156,16 +156,16 @@ impl Beside<f64> for ToMidpoint<'_> {
 }
 
 /// Weights of rows and columns.
-pub(super) struct Weigh<'a> {
-    pub(super) coordinates: &'a [usize],
-    pub(super) turns: &'a Sided<Turn<Block>>,
-    pub(super) momentum: &'a [f64],
+pub(crate) struct Weigh<'a> {
+    pub(crate) coordinates: &'a [usize],
+    pub(crate) turns: &'a Sided<Turn<Block>>,
+    pub(crate) momentum: &'a [f64],
     /// `L_q` and forces, which count `half` and `weight` in an impulse.
-    pub(super) torque: &'a [f64],
-    pub(super) force: &'a [f64],
-    pub(super) half: f64,
-    pub(super) weight: f64,
-    pub(super) weights: &'a mut [Weights],
+    pub(crate) torque: &'a [f64],
+    pub(crate) force: &'a [f64],
+    pub(crate) half: f64,
+    pub(crate) weight: f64,
+    pub(crate) weights: &'a mut [Weights],
 }
 
 impl Beside<f64> for Weigh<'_> {
@@ -192,14 +192,14 @@ impl Beside<f64> for Weigh<'_> {
 }
 
 /// Turns orientations by `ξ`, with what rounding took from them, and writes their rotation vectors.
-pub(super) struct TurnOn<'a> {
-    pub(super) coordinates: &'a [usize],
+pub(crate) struct TurnOn<'a> {
+    pub(crate) coordinates: &'a [usize],
     /// `ξ`, in the place of dynamic coordinates; what is prescribed does not turn.
-    pub(super) increment: &'a [f64],
-    pub(super) orientations: &'a mut [Quaternion],
-    pub(super) low: &'a mut [[f64; 4]],
+    pub(crate) increment: &'a [f64],
+    pub(crate) orientations: &'a mut [Quaternion],
+    pub(crate) low: &'a mut [[f64; 4]],
     /// Dynamic coordinates.
-    pub(super) q: &'a mut [f64],
+    pub(crate) q: &'a mut [f64],
 }
 
 impl Beside<f64> for TurnOn<'_> {
