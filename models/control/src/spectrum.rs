@@ -24,11 +24,10 @@ pub(super) fn eigenvalues(m: &DMatrix<f64>) -> Result<Vec<Complex<f64>>, Riccati
         let schur = Schur::try_new(m, f64::EPSILON, SWEEPS_PER_EIGENVALUE * size)?;
         Some(schur.complex_eigenvalues().iter().copied().collect())
     };
-    let transposed = balanced.transpose();
     found(balanced.clone())
-        .or_else(|| found(transposed.clone()))
-        .or_else(|| found(reflected(balanced)))
-        .or_else(|| found(reflected(transposed)))
+        .or_else(|| found(balanced.transpose()))
+        .or_else(|| found(reflected(balanced.clone())))
+        .or_else(|| found(reflected(balanced.transpose())))
         .ok_or(RiccatiError::Eigenvalues { size })
 }
 

@@ -141,18 +141,6 @@ fn by_halves<S: Scalar, const N: usize>(s: S, coefficients: &[f64; N]) -> S {
     even + odd * s
 }
 
-/// `(−1)ⁱ / (2i + N)!`: of `e_N(s) = Σ (−s)ⁱ / (2i + N)!` for `N ≥ 4` as many terms as half a turn takes; the next is
-/// less than 1e-17 of the first.
-const fn entire<const N: usize>() -> [f64; 14] {
-    let (mut c, mut i) = ([0.0; 14], 0);
-    while i < 14 {
-        let sign = if i % 2 == 0 { 1.0 } else { -1.0 };
-        c[i] = sign * inverse_factorial(2 * i + N);
-        i += 1;
-    }
-    c
-}
-
 /// `e_N = 1/N! − s e_N+2`.
 #[inline(always)]
 fn down<S: Scalar>(s: S, next: S, n: usize) -> S {
@@ -182,10 +170,10 @@ const fn inverse_factorial(n: usize) -> f64 {
     1.0 / product
 }
 
-/// `(−1)ⁱ / (2i + N)!`: the coefficients of `e_N(s) = Σ (−s)ⁱ / (2i + N)!`.
-const fn alternating<const N: usize>() -> [f64; 10] {
-    let (mut c, mut i) = ([0.0; 10], 0);
-    while i < 10 {
+/// `(−1)ⁱ / (2i + N)!`: the first coefficients of `e_N(s) = Σ (−s)ⁱ / (2i + N)!`.
+const fn alternating<const N: usize, const TERMS: usize>() -> [f64; TERMS] {
+    let (mut c, mut i) = ([0.0; TERMS], 0);
+    while i < TERMS {
         let sign = if i % 2 == 0 { 1.0 } else { -1.0 };
         c[i] = sign * inverse_factorial(2 * i + N);
         i += 1;
@@ -193,14 +181,20 @@ const fn alternating<const N: usize>() -> [f64; 10] {
     c
 }
 
+/// `e_N` for `N ≥ 4`, with as many terms as half a turn takes: the next is less than 1e-17 of the first.
+#[inline(always)]
+fn entire<S: Scalar, const N: usize>(s: S) -> S {
+    by_halves(s, const { &alternating::<N, 14>() })
+}
+
 /// `e1 = sin t / t`, `e2 = (1 − cos t) / t²` and `e3 = (t − sin t) / t³` for `s = t²`.
 #[inline]
 fn exponential<S: Scalar>(s: S) -> [S; 3] {
     if s.value() < SERIES_BELOW {
         return [
-            series(s, const { &alternating::<1>() }),
-            series(s, const { &alternating::<2>() }),
-            series(s, const { &alternating::<3>() }),
+            series(s, const { &alternating::<1, 10>() }),
+            series(s, const { &alternating::<2, 10>() }),
+            series(s, const { &alternating::<3, 10>() }),
         ];
     }
     let t = s.sqrt();
@@ -314,8 +308,8 @@ impl<S: Scalar> Turn<S> {
     #[inline(always)]
     pub fn new(xi: Vec3<S>) -> Self {
         let square = xi.dot(xi) * 0.25;
-        let e4 = by_halves(square, const { &entire::<4>() });
-        let e5 = by_halves(square, const { &entire::<5>() });
+        let e4 = entire::<S, 4>(square);
+        let e5 = entire::<S, 5>(square);
         let (e2, e3) = (down(square, e4, 2), down(square, e5, 3));
         let e1 = down(square, e3, 1);
         let inverse = e1.recip() * 0.25;
@@ -472,8 +466,8 @@ impl<S: Scalar> Chart<S> {
     #[inline(always)]
     pub fn new(y: Vec3<S>) -> Self {
         let square = y.dot(y);
-        let e6 = by_halves(square, const { &entire::<6>() });
-        let e7 = by_halves(square, const { &entire::<7>() });
+        let e6 = entire::<S, 6>(square);
+        let e7 = entire::<S, 7>(square);
         let (e4, e5) = (down(square, e6, 4), down(square, e7, 5));
         let (e2, e3) = (down(square, e4, 2), down(square, e5, 3));
         Self { y, square, e: [S::ZERO, down(square, e3, 1), e2, e3, e4, e5, e6, e7] }

@@ -158,7 +158,8 @@ pub fn add_product(
     terms: &mut Vec<Term>,
 ) {
     terms.clear();
-    terms.extend(non_zero(factors));
+    // From within, factors of two kinds are gone through one kind after the other.
+    non_zero(factors).for_each(|term| terms.push(term));
     add_rows(target, source, stride, terms);
 }
 

@@ -16,9 +16,7 @@ use crate::integrator::foresight::{Strayed, is_negligible};
 use crate::integrator::midpoint::{Midpoint, middle};
 use crate::integrator::newton::{CONVERGED, Chord, STALE, is_round_off};
 use crate::integrator::point::{Parts, Point};
-use crate::integrator::predictor::{
-    FEW, LENGTH, best_order, differences_of, known_after, most_known, seen,
-};
+use crate::integrator::predictor::{LENGTH, take_note};
 use crate::integrator::push::weigh;
 use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::residual::sum_of;
@@ -603,20 +601,10 @@ impl<const N: usize> Abreast<N> {
             let States { q, q_low, p, p_low, past, known, order, last } = state;
             add(q, q_low, increment);
             add(p, p_low, impulse);
-            let most = most_known(*known, *evaluations);
-            let seen = seen(*known, most);
             let inertia = &model.conditioning.inertia[..];
             let pushed = push.as_ref().map_or(&[][..], |push| &push.pushed);
-            let few = LanesOf::constant(FEW as f64);
-            // How many are gone through is the same in all lanes, and a constant.
-            *order = if LanesOf::<N>::any(few.at_most(seen)) {
-                let errors = differences_of::<LENGTH, _>(past, increment, inertia, pushed);
-                best_order(&errors, seen, LENGTH - 1)
-            } else {
-                let errors = differences_of::<FEW, _>(past, increment, inertia, pushed);
-                best_order(&errors, seen, FEW - 1)
-            };
-            *known = known_after(*known, *order, most);
+            let counts = [*known, *evaluations];
+            [*known, *order] = take_note(past, increment, inertia, pushed, counts);
             if let (Some(push), Some(last)) = (push, last) {
                 std::mem::swap(&mut last.points, &mut push.points);
                 std::mem::swap(&mut last.factors, &mut systems.first);

@@ -81,6 +81,13 @@ impl BallJoints {
         balls
     }
 
+    /// Begins at orientations.
+    pub(crate) fn start_at(&mut self, orientations: &[Quaternion]) {
+        let Self { start, start_beside, .. } = self;
+        let task = ToMatrices { orientations, matrices: start, beside: start_beside };
+        beside(orientations.len(), task);
+    }
+
     /// How one turns over the step.
     #[inline(always)]
     pub(crate) fn turn(&self, orientation: usize) -> Turn {
@@ -152,10 +159,7 @@ impl Workspace {
         settings: &Settings,
         state: &PreciseState,
     ) {
-        let BallJoints { start, start_beside, .. } = &mut self.balls;
-        let orientations = &state.orientations[..];
-        let task = ToMatrices { orientations, matrices: start, beside: start_beside };
-        beside(orientations.len(), task);
+        self.balls.start_at(&state.orientations);
         for (o, &i) in model.orientations.iter().enumerate() {
             if i >= model.dimensions.dynamic {
                 let end = Quaternion::exp(three(&self.step.q_end, i));

@@ -188,9 +188,7 @@ impl Workspace {
     /// Constraints at the start of the step, with their Jacobian.
     pub(crate) fn prepare_start(&mut self, model: &Model, state: &PreciseState) {
         if model.dimensions.constraints > 0 && self.constraints.start.known < Known::All {
-            for (matrix, q) in self.balls.start.iter_mut().zip(&state.orientations) {
-                *matrix = q.matrix();
-            }
+            self.balls.start_at(&state.orientations);
             self.constraints.start.complete(model, &state.q, &self.balls.start);
         }
     }
@@ -236,9 +234,7 @@ impl Workspace {
         let (dynamic, prescribed) = self.mid.velocity.split_at_mut(state.p.len());
         dynamic.fill(0.0);
         prescribed.copy_from_slice(&state.v);
-        for (matrix, orientation) in self.balls.start.iter_mut().zip(&state.orientations) {
-            *matrix = orientation.matrix();
-        }
+        self.balls.start_at(&state.orientations);
         let (orientations, derivatives) =
             (&self.balls.start, [&mut *self.mid.l_q, &mut *self.mid.l_v]);
         self.mid.mechanics.gradient(model, &state.q, orientations, &self.mid.velocity, derivatives);

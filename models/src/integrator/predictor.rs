@@ -50,12 +50,12 @@ pub(crate) const LENGTH: usize = 12;
 const BEYOND: f64 = 2.0;
 
 /// As many differences suffice where one evaluation a step does.
-pub(crate) const FEW: usize = 8;
+const FEW: usize = 8;
 
 /// Takes new increments into `COUNT` differences of past ones, those from `∇²` on less what was pushed, if anything was,
 /// and sums up their squares, weighed.
 #[inline(always)]
-pub(crate) fn differences_of<const COUNT: usize, S: Scalar>(
+fn differences_of<const COUNT: usize, S: Scalar>(
     rows: &mut [[S; LENGTH]],
     increments: &[S],
     inertia: &[f64],
@@ -88,16 +88,18 @@ fn difference<'a, const COUNT: usize, S: Scalar>(
     errors
 }
 
-/// Differences that the next prediction takes, of those that mean something: the more, the better they have been.
+/// Differences that the next prediction takes, of those that were seen: the more, the better they have been. `count` are
+/// there.
 #[inline(always)]
-pub(crate) fn best_order<S: Compared>(errors: &[S; LENGTH], known: S, most: usize) -> S {
+fn best_order<S: Compared>(errors: &[S; LENGTH], seen: S, count: usize) -> S {
     let (mut least, mut order) = (errors[1], S::ONE);
-    for (m, &error) in (2..).zip(&errors[2..=most.clamp(1, LENGTH - 1)]) {
+    // By itself a plant has as many as are gone through.
+    let count = if S::IS_SEVERAL { count } else { seen.value() as usize + 1 };
+    for (m, &error) in (2..).zip(&errors[2..count.clamp(2, LENGTH)]) {
         let place = S::constant(f64::from(m));
         let mut is_better = error.less(least);
-        // By itself a plant has as many as are gone through.
         if S::IS_SEVERAL {
-            is_better = is_better & place.at_most(known);
+            is_better = is_better & place.at_most(seen);
         }
         least = S::choose(is_better, error, least);
         order = S::choose(is_better, place, order);
@@ -112,21 +114,42 @@ fn least<S: Compared>(a: S, b: S) -> S {
 
 /// How many differences may be known after a step, by those that were and how often the equations were evaluated.
 #[inline(always)]
-pub(crate) fn most_known<S: Compared>(known: S, evaluations: S) -> S {
+fn most_known<S: Compared>(known: S, evaluations: S) -> S {
     let [one, few, all] = [1.0, FEW as f64, LENGTH as f64].map(S::constant);
     S::choose(one.less(evaluations), all, known.max(few))
 }
 
 /// Of the differences of a new increment, those of lower order than this and one more mean something.
 #[inline(always)]
-pub(crate) fn seen<S: Compared>(known: S, most: S) -> S {
+fn seen<S: Compared>(known: S, most: S) -> S {
     least(known, most - 1.0).max(S::ONE)
 }
 
 /// Differences that are known after a step, of which the next one takes so many.
 #[inline(always)]
-pub(crate) fn known_after<S: Compared>(known: S, order: S, most: S) -> S {
+fn known_after<S: Compared>(known: S, order: S, most: S) -> S {
     least(least(known + 1.0, (order + BEYOND).max(S::constant(FEW as f64))), most)
+}
+
+/// Takes note of increments in the differences of past ones, by how many of these were known and how often the
+/// equations were evaluated; returns how many are known now, and how many the next prediction takes.
+#[inline(always)]
+pub(crate) fn take_note<S: Compared>(
+    rows: &mut [[S; LENGTH]],
+    increments: &[S],
+    inertia: &[f64],
+    pushed: &[S],
+    [known, evaluations]: [S; 2],
+) -> [S; 2] {
+    let most = most_known(known, evaluations);
+    let seen = seen(known, most);
+    // Of plants side by side, so many as one of them needs are gone through.
+    let order = if S::any(S::constant(FEW as f64).at_most(seen)) {
+        best_order(&differences_of::<LENGTH, _>(rows, increments, inertia, pushed), seen, LENGTH)
+    } else {
+        best_order(&differences_of::<FEW, _>(rows, increments, inertia, pushed), seen, FEW)
+    };
+    [known_after(known, order, most), order]
 }
 
 impl Past {
@@ -216,18 +239,10 @@ impl Past {
         if self.kind != Kind::Increments {
             return;
         }
-        let known = f64::from(self.known);
-        let most = most_known(known, f64::from(evaluations));
-        let seen = seen(known, most);
         let rows = self.numbers.as_chunks_mut::<LENGTH>().0;
-        let errors = if seen < FEW as f64 {
-            differences_of::<FEW, _>(rows, increments, inertia, pushed)
-        } else {
-            differences_of::<LENGTH, _>(rows, increments, inertia, pushed)
-        };
-        let order = best_order(&errors, seen, seen as usize);
-        self.known = known_after(known, order, most) as u8;
-        self.order = order as u8;
+        let counts = [self.known.into(), evaluations.into()];
+        let [known, order] = take_note(rows, increments, inertia, pushed, counts);
+        (self.known, self.order) = (known as u8, order as u8);
     }
 
     /// Takes note of the velocities and forces at the stages of a step.

@@ -350,9 +350,7 @@ impl Workspace {
 
     /// Gradient of the Lagrangian without springs at any configuration, and at the velocity that is there.
     fn gradient(&mut self, model: &Model, state: &PreciseState) {
-        for (matrix, orientation) in self.balls.start.iter_mut().zip(&state.orientations) {
-            *matrix = orientation.matrix();
-        }
+        self.balls.start_at(&state.orientations);
         self.mid.mechanics.poses.evaluate(&model.dynamics, &state.q, &self.balls.start);
         self.mid.mechanics.momenta.gradient(
             &model.dynamics,
