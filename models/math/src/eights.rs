@@ -80,6 +80,24 @@ pub trait Eight: Copy + 'static {
         }
         Self::transposed(eight)
     }
+    /// [`Eight::spread`] to the rows that are named.
+    #[inline(always)]
+    fn spread_to(numbers: [Self; 8], rows: &mut [Block], of: &[usize]) {
+        let mut eight = [Block::ZERO; 8];
+        Self::spread(numbers, &mut eight);
+        for (own, row) in eight.into_iter().zip(of) {
+            rows[*row] = own;
+        }
+    }
+    /// [`Eight::collect`] from the rows that are named.
+    #[inline(always)]
+    fn collect_from(rows: &[Block], of: &[usize]) -> [Self; 8] {
+        let mut eight = [Block::ZERO; 8];
+        for (own, row) in eight.iter_mut().zip(of) {
+            *own = rows[*row];
+        }
+        Self::collect(&eight)
+    }
     /// All numbers times a factor.
     #[inline(always)]
     fn scaled(self, factor: f64) -> Self {

@@ -285,7 +285,7 @@ impl<S: Scalar> Closure<S> {
             if let Some(parent) = self.pulls.get_mut(joint.parent) {
                 parent.add(&pull);
             }
-            let (axis, place) = (self.poses.axis(j), self.poses.position[j]);
+            let (axis, place) = (self.poses.axis(tree, j), self.poses.place(tree, j));
             let [x, y, z] = pull.product.0;
             let along = x[0] + y[1] + z[2] - place.dot(pull.force);
             let of_hinge = |axis: Vec3<S>| {
@@ -300,11 +300,11 @@ impl<S: Scalar> Closure<S> {
             let mut i = j;
             while let Some(above) = tree.joints.get(i) {
                 if above.kind != JointKind::Prismatic {
-                    let value = self.poses.axis(i).dot(torque);
+                    let value = self.poses.axis(tree, i).dot(torque);
                     out[own * n + above.coordinate] += value;
                     if i != j {
                         let mirrored = if tree.one_ball(i, j) {
-                            axis.dot(of_hinge(self.poses.axis(i)))
+                            axis.dot(of_hinge(self.poses.axis(tree, i)))
                         } else {
                             value
                         };

@@ -81,7 +81,7 @@ impl InPlane {
                 reach = reach.beyond(length(self.edge[i]));
             }
             if joint.kind == JointKind::Prismatic {
-                self.slide[i] = local(poses.axis(at));
+                self.slide[i] = local(poses.axis(tree, at));
                 reach.moved += q[i].abs();
             } else {
                 reach.turned += q[i].abs();

@@ -134,7 +134,8 @@ impl Kinematics {
         self.evaluate();
         let finite = |v: &Vec3| v.0.iter().all(|x| x.is_finite());
         let moves = |i: usize| {
-            let (twist, momentum) = (self.momenta.twist.get(i), self.momenta.momentum.get(i));
+            let (twist, momentum) =
+                (self.momenta.twist_of(&self.tree, i), self.momenta.momentum_of(&self.tree, i));
             let (Motion { w, v }, Force { f, .. }) = (twist, momentum);
             [w, v, f].iter().all(finite)
         };
@@ -156,7 +157,10 @@ impl Kinematics {
         let (position, origin) = self.poses.point(&self.tree, at);
         let (axes, twist) = match at.joint {
             WORLD => (*rotation, Motion::default()),
-            joint => (self.poses.rotation[joint].times(rotation), self.momenta.twist.get(joint)),
+            joint => (
+                self.poses.rotation[joint].times(rotation),
+                self.momenta.twist_of(&self.tree, joint),
+            ),
         };
         FrameMotion {
             position: (position + origin).0,
@@ -173,7 +177,7 @@ impl Kinematics {
         let (position, _) = self.poses.point(&self.tree, &point.at);
         for joint in self.tree.path(point.at.joint) {
             let linear = self.poses.point_gradient(&self.tree, joint, position);
-            let angular = self.momenta.axis.get::<f64>(joint).w;
+            let angular = self.momenta.axis_of(&self.tree, joint).w;
             let mut column = jacobian.column_mut(self.tree.joints[joint].coordinate);
             for k in 0..3 {
                 column[k] = linear[k];
@@ -196,9 +200,9 @@ impl Kinematics {
         let mut jacobian = DMatrix::zeros(3, self.q.len());
         let mass = self.center_of_mass().mass_kg;
         for (i, joint) in self.tree.joints.iter().enumerate().filter(|_| mass > 0.0) {
-            let (moment, tensor) = (self.momenta.moment.get(i), Sym3::default());
+            let (moment, tensor) = (self.momenta.moment_of(&self.tree, i), Sym3::default());
             let carried = Inertia { mass: joint.subtree_mass, moment, tensor };
-            let momentum = carried.momentum(self.momenta.axis.get(i));
+            let momentum = carried.momentum(self.momenta.axis_of(&self.tree, i));
             for k in 0..3 {
                 jacobian[(k, joint.coordinate)] = momentum.f[k] / mass;
             }

@@ -50,7 +50,7 @@ impl Midpoint {
         let Some(fields) = fields else { return };
         for (first, joint) in joints.iter().enumerate() {
             if joint.kind == JointKind::Ball(0) && joint.coordinate < model.dimensions.dynamic {
-                take(joint.orientation, &fields.within_ball(momenta, first));
+                take(joint.orientation, &fields.within_ball(&model.dynamics, momenta, first));
             }
         }
     }

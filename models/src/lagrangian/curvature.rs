@@ -19,7 +19,7 @@ use plantd_math::tree_lu::TreeLu;
 
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
-use crate::lagrangian::sums::{Sums, firsts};
+use crate::lagrangian::sums::{Sums, firsts, firsts_of_links};
 use crate::model::mechanism::Pair;
 use crate::model::tree::{Rotational, Tree};
 
@@ -116,31 +116,25 @@ impl<S: Scalar> Beside<S> for Evaluate<'_, S> {
     #[inline(always)]
     fn run<W: Wide<S>>(self) {
         let Self { curvature, tree, poses, momenta } = self;
-        for i in firsts::<S>(tree) {
-            curvature.place::<W>(tree, poses, momenta, i);
+        if tree.has_balls {
+            curvature.generate::<W, true>(tree, poses, momenta);
+        } else {
+            curvature.generate::<W, false>(tree, poses, momenta);
         }
-        curvature.tensors.ascend::<W, false>(tree);
-        for i in firsts::<S>(tree) {
-            let (axis, rate) = (momenta.axis.wide::<S, W>(i), momenta.axis_rate.wide::<S, W>(i));
-            let [xx, yy, zz, xy, xz, yz, ..] = curvature.tensors.take::<W>(i);
-            let composite = Inertia {
-                mass: tree.fixed::<S, W>(i).subtree_mass,
-                moment: momenta.moment.wide::<S, W>(i),
-                tensor: Sym3 { xx, yy, zz, xy, xz, yz },
-            };
-            let force = composite.momentum(axis);
-            let turned = axis.cross_force(momenta.momentum.wide::<S, W>(i));
-            let slope = turned.plus(composite.momentum(rate));
-            let Vertical { horizontal, gravity } = curvature.vertical;
-            let [e1, e2] = horizontal.map(Vec3::<W>::lift);
-            let tilt = [axis.w.dot(e1), axis.w.dot(e2)];
-            let weight = [force.f.dot(e2) * gravity, -force.f.dot(e1) * gravity];
-            let at = i..i + S::BESIDE;
-            W::spread(row(axis.w, axis.v, [W::ZERO; 2]), &mut curvature.axis[at.clone()]);
-            W::spread(row(rate.w, rate.v, tilt), &mut curvature.rate[at.clone()]);
-            W::spread(row(force.n, force.f, [W::ZERO; 2]), &mut curvature.force[at.clone()]);
-            W::spread(row(slope.n, slope.f, weight), &mut curvature.slope[at]);
-        }
+    }
+}
+
+/// Puts numbers into the rows of joints, which follow each other where there are no ball joints.
+#[inline(always)]
+fn put_rows<S: Scalar, W: Wide<S>, const BALLS: bool>(
+    rows: &mut [S::Row],
+    joints: &[usize],
+    numbers: [W; 8],
+) {
+    if BALLS {
+        W::spread_to(numbers, rows, joints);
+    } else {
+        W::spread(numbers, &mut rows[joints[0]..joints[0] + S::BESIDE]);
     }
 }
 
@@ -155,7 +149,7 @@ impl<S: Scalar> Curvature<S> {
         let rows = || vec![S::Row::default(); n.next_multiple_of(S::BESIDE)];
         Self {
             vertical: Vertical::new(gravity),
-            tensors: Sums::new(n),
+            tensors: Sums::new(&tree.slots),
             axis: rows(),
             rate: rows(),
             force: rows(),
@@ -170,9 +164,55 @@ impl<S: Scalar> Curvature<S> {
         S::beside(tree.joints.len(), Evaluate { curvature: self, tree, poses, momenta });
     }
 
-    /// Inertia about the origin of the bodies of the joints that begin with `i`.
+    /// `BALLS`: some joint is a ball joint.
     #[inline(always)]
-    fn place<W: Wide<S>>(&mut self, tree: &Tree, poses: &Poses<S>, momenta: &Momenta<S>, i: usize) {
+    fn generate<W: Wide<S>, const BALLS: bool>(
+        &mut self,
+        tree: &Tree,
+        poses: &Poses<S>,
+        momenta: &Momenta<S>,
+    ) {
+        let slots = &tree.slots;
+        for i in firsts_of_links::<S>(tree) {
+            self.place::<W, BALLS>(tree, poses, momenta, i);
+        }
+        self.tensors.ascend::<W, false>(&slots.parents);
+        for i in firsts::<S>(tree) {
+            let (axis, rate) = (momenta.axis.wide::<S, W>(i), momenta.axis_rate.wide::<S, W>(i));
+            let [xx, yy, zz, xy, xz, yz, ..] = self.tensors.take_from::<W, BALLS>(i, &slots.links);
+            let composite = Inertia {
+                mass: tree.fixed::<S, W>(i).subtree_mass,
+                moment: momenta.moment.wide::<S, W>(i),
+                tensor: Sym3 { xx, yy, zz, xy, xz, yz },
+            };
+            let force = composite.momentum(axis);
+            let turned = axis.cross_force(momenta.momentum.wide::<S, W>(i));
+            let slope = turned.plus(composite.momentum(rate));
+            let Vertical { horizontal, gravity } = self.vertical;
+            let [e1, e2] = horizontal.map(Vec3::<W>::lift);
+            let tilt = [axis.w.dot(e1), axis.w.dot(e2)];
+            let weight = [force.f.dot(e2) * gravity, -force.f.dot(e1) * gravity];
+            let joints = &slots.joints[i..i + S::BESIDE];
+            let axis = row(axis.w, axis.v, [W::ZERO; 2]);
+            let rate = row(rate.w, rate.v, tilt);
+            put_rows::<S, W, BALLS>(&mut self.axis, joints, axis);
+            put_rows::<S, W, BALLS>(&mut self.rate, joints, rate);
+            let slope = row(slope.n, slope.f, weight);
+            let force = row(force.n, force.f, [W::ZERO; 2]);
+            put_rows::<S, W, BALLS>(&mut self.force, joints, force);
+            put_rows::<S, W, BALLS>(&mut self.slope, joints, slope);
+        }
+    }
+
+    /// Inertia about the origin of the bodies of the links that begin with `i`.
+    #[inline(always)]
+    fn place<W: Wide<S>, const BALLS: bool>(
+        &mut self,
+        tree: &Tree,
+        poses: &Poses<S>,
+        momenta: &Momenta<S>,
+        i: usize,
+    ) {
         let rotational = tree.rotational::<S>(i);
         if let Rotational::None = rotational {
             self.tensors.put(i, [W::ZERO; 8]);
@@ -184,7 +224,7 @@ impl<S: Scalar> Curvature<S> {
             Rotational::None | Rotational::Point => {}
             Rotational::Isotropic(_) => tensor = fixed.inertia.add(&tensor),
             Rotational::Full(_) => {
-                let rotation = poses.wide::<W>(i).rotation();
+                let rotation = poses.wide::<W, BALLS>(tree, i).rotation();
                 tensor = fixed.inertia.rotated(&rotation).add(&tensor);
             }
         }

@@ -26,7 +26,7 @@ pub(crate) fn potential_energy(model: &Model, poses: &Poses, momenta: &Momenta, 
     let roots = tree.joints.iter().enumerate().filter(|(i, joint)| joint.root == *i);
     let weight: f64 = roots
         .map(|(i, root)| {
-            let moment = momenta.moment.get::<f64>(i) + poses.origin[i] * root.subtree_mass;
+            let moment = momenta.moment_of(tree, i) + poses.origin[i] * root.subtree_mass;
             model.gravity.map_or(0.0, |g| g.dot(moment))
         })
         .sum();

@@ -27,7 +27,7 @@ use plantd_math::spatial::{Force, Mat3, Motion, Vec3};
 use crate::lagrangian::instant::Instant;
 use crate::lagrangian::momenta::Momenta;
 use crate::model::mechanism::{Forces, Model, PointForce, Potentials, Spring};
-use crate::model::tree::WORLD;
+use crate::model::tree::{Tree, WORLD};
 
 /// Takes a wrench, and its change with the motion of the body `(J, J̇)`.
 pub(crate) type Take<'a> = &'a mut dyn FnMut(Force, &dyn Fn(Motion, Motion) -> Force);
@@ -118,9 +118,9 @@ fn add(both: &mut Both, column: usize, Force { n, f }: Force) {
 }
 
 /// Axis and rate of a joint.
-fn motions(momenta: &Momenta, joint: usize) -> [Block; 2] {
-    let Momenta { axis, axis_rate, .. } = momenta;
-    [axis, axis_rate].map(|all| all.get::<f64>(joint)).map(|Motion { w, v }| six(w, v))
+fn motions(momenta: &Momenta, tree: &Tree, joint: usize) -> [Block; 2] {
+    let motions = [momenta.axis_of(tree, joint), momenta.axis_rate_of(tree, joint)];
+    motions.map(|Motion { w, v }| six(w, v))
 }
 
 impl OwnTorque {
@@ -208,11 +208,11 @@ impl Fields {
     }
 
     /// What the axes of a ball joint that begin with `first` have among themselves.
-    pub(crate) fn within_ball(&self, momenta: &Momenta, first: usize) -> OwnTorque {
+    pub(crate) fn within_ball(&self, tree: &Tree, momenta: &Momenta, first: usize) -> OwnTorque {
         let mut own = OwnTorque::NONE;
         for (row, column) in (0..9).map(|entry| (entry / 3, entry % 3)) {
             let Given { turn, back, .. } = &self.given[first + row];
-            let [axis, rate] = motions(momenta, first + column);
+            let [axis, rate] = motions(momenta, tree, first + column);
             own.by_turn.0[column].0[row] = Block::dot_of(&axis, turn) + Block::dot_of(&rate, back);
             own.by_velocity.0[column].0[row] = Block::dot_of(&axis, back);
         }
@@ -238,7 +238,7 @@ impl InEights for Gather<'_> {
                 sum.add::<E>(own);
             }
             let Sum { wrench, by_motion, by_rate } = &sum;
-            let [axis, rate] = &motions(at.momenta, i);
+            let [axis, rate] = &motions(at.momenta, at.tree, i);
             let Motion { w: n, v: f } = motion(wrench);
             let Force { n, f } = motion(axis).cross_force(Force { n, f });
             let given = &mut given[i];

@@ -6,16 +6,18 @@ use plantd_math::spatial::{Mat3, Pose, Vec3};
 
 use crate::model::tree::{Attachment, JointKind, Tree, WORLD};
 
-/// Poses of the joints of a tree, each position measured from the origin of its own tree.
+/// Poses of the joints of a tree, each position measured from the origin of its own tree. A ball joint has its pose at
+/// its last axis.
 #[derive(Clone, Debug)]
 pub(crate) struct Poses<S: Scalar = f64> {
     pub(crate) rotation: Vec<Mat3<S>>,
     pub(crate) position: Vec<Vec3<S>>,
     /// World position of the origin of the tree rooted at a joint; meaningful for roots.
     pub(crate) origin: Vec<Vec3<S>>,
-    /// Rotations and positions, where those of several joints lie side by side.
+    /// Poses by slot, where those of several lie side by side; of the first two axes of a ball joint the `z` axis and
+    /// the position alone.
     sides: Sided<Pose<S::Several>>,
-    /// Position of a joint relative to its parent.
+    /// Position of a joint relative to what it hangs from.
     edge: Vec<Vec3<S>>,
     /// Angles by which hinges and screws turn about their axes, in their order, and their sines and cosines.
     angles: Vec<S>,
@@ -104,20 +106,57 @@ impl<S: Scalar> Poses<S> {
 
     /// World-axes direction of the axis of a joint.
     #[inline(always)]
-    pub(crate) fn axis(&self, joint: usize) -> Vec3<S> {
-        self.rotation[joint].0[2]
+    pub(crate) fn axis(&self, tree: &Tree, joint: usize) -> Vec3<S> {
+        match tree.joints[joint].kind {
+            JointKind::Ball(axis) => self.rotation[joint + 2 - axis].0[axis],
+            _ => self.rotation[joint].0[2],
+        }
     }
 
-    /// Poses of the joints that begin with `i`.
+    /// Where a joint is.
     #[inline(always)]
-    pub(crate) fn wide<W: Wide<S>>(&self, i: usize) -> Pose<W> {
-        if S::BESIDE > 1 { self.sides.wide::<S, W>(i) } else { self.pose(i).map(W::of_one) }
+    pub(crate) fn place(&self, tree: &Tree, joint: usize) -> Vec3<S> {
+        self.position[tree.joints[joint].last_axis(joint)]
+    }
+
+    /// Poses of the slots that begin with `i`; of the first two axes of a ball joint, the `z` axis and the position
+    /// alone. `BALLS`: some joint is a ball joint.
+    #[inline(always)]
+    pub(crate) fn wide<W: Wide<S>, const BALLS: bool>(&self, tree: &Tree, i: usize) -> Pose<W> {
+        if S::BESIDE > 1 {
+            return self.sides.wide::<S, W>(i);
+        }
+        let joint = tree.slots.joints[i];
+        let mut pose = self.pose(tree.joints[joint].last_axis(joint));
+        if BALLS {
+            pose.z = self.axis(tree, joint);
+        }
+        pose.map(W::of_one)
     }
 
     #[inline(always)]
     fn pose(&self, joint: usize) -> Pose<S> {
         let Mat3([x, y, z]) = self.rotation[joint];
         Pose { x, y, z, at: self.position[joint] }
+    }
+
+    /// Puts the pose of a joint, at its last axis, into its slots.
+    #[inline(always)]
+    fn put_beside(&mut self, tree: &Tree, joint: usize) {
+        if S::BESIDE == 1 {
+            return;
+        }
+        let pose = self.pose(joint);
+        self.sides.put::<S>(tree.slots.of(joint), pose);
+        if let JointKind::Ball(_) = tree.joints[joint].kind {
+            for (axis, z) in [pose.x, pose.y].into_iter().enumerate() {
+                let slot = tree.slots.of(joint - 2 + axis);
+                let (sides, lane) = (&mut self.sides.0[slot / S::BESIDE], slot % S::BESIDE);
+                let put = |several: &mut S::Several, number: S| number.put(several, lane);
+                sides.z.zip(z, put);
+                sides.at.zip(pose.at, put);
+            }
+        }
     }
 
     /// Poses at the configuration `q`, with the orientations of ball joints: one pass from the roots
@@ -147,10 +186,7 @@ impl<S: Scalar> Poses<S> {
         let (mut last, mut last_position) = (world, zero);
         for (i, joint) in tree.joints.iter().enumerate() {
             if let (true, JointKind::Ball(1 | 2)) = (OTHER, joint.kind) {
-                // The entry before has turned already.
-                let [x, y, z] = last;
-                last = [y, z, x];
-                last_position = self.set_aside::<W>(tree, i, last, last_position);
+                // The whole joint has its pose.
                 continue;
             }
             let (parent, position) = match joint.parent {
@@ -188,16 +224,17 @@ impl<S: Scalar> Poses<S> {
                 JointKind::Ball(0) if OTHER => {
                     let Mat3([x, y, z]) = &orientations[joint.orientation];
                     last = [
+                        moving::<S, W>(&last, x),
                         moving::<S, W>(&last, y),
                         moving::<S, W>(&last, z),
-                        moving::<S, W>(&last, x),
                     ];
                 }
                 _ => {}
             }
-            W::put_triple(edge, &mut self.edge[i].0);
+            let own = if OTHER { joint.last_axis(i) } else { i };
+            W::put_triple(edge, &mut self.edge[own].0);
             let position = W::triple_sum(position, edge);
-            last_position = self.set_aside::<W>(tree, i, last, position);
+            last_position = self.set_aside::<W>(tree, own, last, position);
         }
     }
 
@@ -218,9 +255,7 @@ impl<S: Scalar> Poses<S> {
             self.move_origin(tree, joint);
             position = W::triple(&[S::ZERO; 3]);
         }
-        if S::BESIDE > 1 {
-            self.sides.put::<S>(joint, self.pose(joint));
-        }
+        self.put_beside(tree, joint);
         position
     }
 
@@ -229,12 +264,13 @@ impl<S: Scalar> Poses<S> {
         self.origin[tree.joints[anchor].root] += self.position[anchor];
         self.position[anchor] = Vec3::ZERO;
         let mut i = anchor;
-        while tree.joints[i].parent != WORLD {
-            let parent = tree.joints[i].parent;
-            self.position[parent] = self.position[i] - self.edge[i];
-            if S::BESIDE > 1 {
-                self.sides.put::<S>(parent, self.pose(parent));
+        loop {
+            let parent = tree.joints[tree.joints[i].first_axis(i)].parent;
+            if parent == WORLD {
+                return;
             }
+            self.position[parent] = self.position[i] - self.edge[i];
+            self.put_beside(tree, parent);
             i = parent;
         }
     }
@@ -257,13 +293,11 @@ impl<S: Scalar> Poses<S> {
     /// origin of the joint's tree.
     #[inline(always)]
     pub(crate) fn point_gradient(&self, tree: &Tree, joint: usize, point: Vec3<S>) -> Vec3<S> {
-        let axis = self.axis(joint);
+        let (axis, arm) = (self.axis(tree, joint), point - self.place(tree, joint));
         match tree.joints[joint].kind {
             JointKind::Prismatic => axis,
-            JointKind::Revolute | JointKind::Ball(_) => axis.cross(point - self.position[joint]),
-            JointKind::Screw(pitch) => {
-                axis.cross(point - self.position[joint]) + axis.scaled(pitch)
-            }
+            JointKind::Revolute | JointKind::Ball(_) => axis.cross(arm),
+            JointKind::Screw(pitch) => axis.cross(arm) + axis.scaled(pitch),
         }
     }
 
@@ -272,7 +306,7 @@ impl<S: Scalar> Poses<S> {
     pub(crate) fn turned(&self, tree: &Tree, joint: usize, vector: Vec3<S>) -> Vec3<S> {
         match tree.joints[joint].kind {
             JointKind::Prismatic => Vec3::ZERO,
-            _ => self.axis(joint).cross(vector),
+            _ => self.axis(tree, joint).cross(vector),
         }
     }
 

@@ -12,29 +12,30 @@ use plantd_math::sided::Sided;
 use plantd_math::spatial::{Force, Motion, Pose, Vec3};
 
 use crate::lagrangian::kinematics::Poses;
-use crate::lagrangian::sums::{Sums, firsts};
-use crate::model::tree::{Joint, JointKind, Rotational, Tree};
+use crate::lagrangian::sums::{Sums, firsts, firsts_of_links};
+use crate::model::slots::Slots;
+use crate::model::tree::{JointKind, Rotational, Tree};
 
-/// Twists and momenta of the joints of a tree.
+/// Twists and momenta of a tree.
 ///
-/// Only sums along the tree need one joint after the other: all else is computed for several side by side.
+/// Only sums along the tree need one link after the other: all else is computed for several [slots] side by side.
+///
+/// [slots]: crate::model::slots
 #[derive(Clone, Debug)]
 pub(crate) struct Momenta<S: Scalar = f64> {
-    /// Joint axes `J` as twists.
+    /// Joint axes `J` as twists, by slot.
     pub(crate) axis: Sided<Motion<S::Several>>,
     /// Their rates `J̇`.
     pub(crate) axis_rate: Sided<Motion<S::Several>>,
-    /// Twists `V`.
-    pub(crate) twist: Sided<Motion<S::Several>>,
-    /// Momentum `H` of each subtree.
+    /// Momentum `H` of the subtree of each.
     pub(crate) momentum: Sided<Force<S::Several>>,
-    /// First moment of mass of each subtree.
+    /// First moment of mass of the subtree.
     pub(crate) moment: Sided<Vec3<S::Several>>,
-    /// Centres of mass of the bodies.
+    /// Twists `V` of the links.
+    twist: Sided<Motion<S::Several>>,
+    /// Centres of mass of their bodies.
     pub(crate) center: Sided<Vec3<S::Several>>,
     sums: Sums<S>,
-    /// Twists of what joints hang from, where ball joints need them.
-    carriers: Sums<S>,
 }
 
 /// What [`Momenta::gradient`] does.
@@ -70,18 +71,27 @@ impl<S: Scalar> Beside<S> for Gradient<'_, S> {
                 let f = g * tree.fixed::<S, W>(i).subtree_mass;
                 torque += axis.dot(Force { n: momenta.moment.wide::<S, W>(i).cross(g), f });
             }
-            scatter(tree, i, axis.dot(momentum), l_v);
-            scatter(tree, i, torque, l_q);
+            scatter(&tree.slots, i, axis.dot(momentum), l_v);
+            scatter(&tree.slots, i, torque, l_q);
         }
     }
 }
 
-/// Numbers of the joints that begin with `i`, from a list of those of coordinates; zero beyond the list.
+/// Numbers of the slots that begin with `i`, from a list of those of coordinates; zero beyond the list.
 #[inline(always)]
-fn collect<S: Scalar, W: Wide<S>>(tree: &Tree, i: usize, list: &[S]) -> W {
+fn collect<S: Scalar, W: Wide<S>>(slots: &Slots, i: usize, list: &[S]) -> W {
+    match list.get(i..i + S::BESIDE) {
+        Some(numbers) if slots.are_in_order => W::load(&S::several(|lane| numbers[lane])),
+        _ => collect_of(&slots.coordinates[0][i..i + S::BESIDE], list),
+    }
+}
+
+/// Numbers of coordinates from a list; zero beyond it.
+#[inline(always)]
+fn collect_of<S: Scalar, W: Wide<S>>(coordinates: &[usize], list: &[S]) -> W {
     let mut several = S::Several::default();
-    for (lane, joint) in tree.joints[i..].iter().take(S::BESIDE).enumerate() {
-        if let Some(number) = list.get(joint.coordinate) {
+    for (lane, coordinate) in coordinates.iter().enumerate() {
+        if let Some(number) = list.get(*coordinate) {
             number.put(&mut several, lane);
         }
     }
@@ -90,29 +100,72 @@ fn collect<S: Scalar, W: Wide<S>>(tree: &Tree, i: usize, list: &[S]) -> W {
 
 /// The way back, but for what is beyond the list.
 #[inline(always)]
-fn scatter<S: Scalar, W: Wide<S>>(tree: &Tree, i: usize, wide: W, list: &mut [S]) {
+fn scatter<S: Scalar, W: Wide<S>>(slots: &Slots, i: usize, wide: W, list: &mut [S]) {
     let mut several = S::Several::default();
     wide.store(&mut several);
-    for (lane, joint) in tree.joints[i..].iter().take(S::BESIDE).enumerate() {
-        if let Some(number) = list.get_mut(joint.coordinate) {
-            *number = S::one(&several, lane);
+    match list.get_mut(i..i + S::BESIDE) {
+        Some(numbers) if slots.are_in_order => {
+            for (lane, number) in numbers.iter_mut().enumerate() {
+                *number = S::one(&several, lane);
+            }
+        }
+        _ => {
+            for (lane, coordinate) in slots.coordinates[0][i..i + S::BESIDE].iter().enumerate() {
+                if let Some(number) = list.get_mut(*coordinate) {
+                    *number = S::one(&several, lane);
+                }
+            }
         }
     }
 }
 
+#[inline(always)]
+fn motion<W: Copy>([p, q, r, x, y, z, ..]: [W; 8]) -> Motion<W> {
+    Motion { w: Vec3([p, q, r]), v: Vec3([x, y, z]) }
+}
+
 impl<S: Scalar> Momenta<S> {
     pub(crate) fn new(tree: &Tree) -> Self {
-        let n = tree.joints.len();
+        let (n, links) = (tree.joints.len(), tree.slots.parents.len());
         Self {
             axis: Sided::zeros::<S>(n),
             axis_rate: Sided::zeros::<S>(n),
-            twist: Sided::zeros::<S>(n),
             momentum: Sided::zeros::<S>(n),
             moment: Sided::zeros::<S>(n),
-            center: Sided::zeros::<S>(n),
-            sums: Sums::new(n),
-            carriers: Sums::new(if tree.has_balls { n } else { 0 }),
+            twist: Sided::zeros::<S>(links),
+            center: Sided::zeros::<S>(links),
+            sums: Sums::new(&tree.slots),
         }
+    }
+
+    /// `J` of a joint, or of one axis of a ball joint.
+    #[inline(always)]
+    pub(crate) fn axis_of(&self, tree: &Tree, joint: usize) -> Motion<S> {
+        self.axis.get::<S>(tree.slots.of(joint))
+    }
+
+    /// `J̇` of a joint, or of one axis of a ball joint.
+    #[inline(always)]
+    pub(crate) fn axis_rate_of(&self, tree: &Tree, joint: usize) -> Motion<S> {
+        self.axis_rate.get::<S>(tree.slots.of(joint))
+    }
+
+    /// `V` of what a joint carries.
+    #[inline(always)]
+    pub(crate) fn twist_of(&self, tree: &Tree, joint: usize) -> Motion<S> {
+        self.twist.get::<S>(tree.slots.link(joint))
+    }
+
+    /// `H` of what a joint carries.
+    #[inline(always)]
+    pub(crate) fn momentum_of(&self, tree: &Tree, joint: usize) -> Force<S> {
+        self.momentum.get::<S>(tree.slots.of(joint))
+    }
+
+    /// The first moment of mass of what a joint carries.
+    #[inline(always)]
+    pub(crate) fn moment_of(&self, tree: &Tree, joint: usize) -> Vec3<S> {
+        self.moment.get::<S>(tree.slots.of(joint))
     }
 
     /// Writes `∂L/∂q` and `∂L/∂v` of the dynamic coordinates, the first `l_q.len()` ones.
@@ -132,7 +185,7 @@ impl<S: Scalar> Momenta<S> {
         );
     }
 
-    /// From the roots to the leaves; `BALLS`: some joint is a ball joint.
+    /// From the roots to the leaves, and back; `BALLS`: some joint is a ball joint.
     #[inline(always)]
     fn forward<W: Wide<S>, const BALLS: bool>(
         &mut self,
@@ -140,34 +193,38 @@ impl<S: Scalar> Momenta<S> {
         poses: &Poses<S>,
         velocity: &[S],
     ) {
+        let slots = &tree.slots;
         for i in firsts::<S>(tree) {
-            self.place::<W>(tree, poses, velocity, i);
+            self.place::<W, BALLS>(tree, poses, velocity, i);
         }
-        self.sums.descend::<W, false>(tree);
-        if BALLS {
-            // The axes of a ball are carried by what the whole joint hangs from.
-            self.carriers.copy_from::<W>(&self.sums, |i| match tree.joints.get(i) {
-                Some(Joint { kind: JointKind::Ball(axis), .. }) => tree.joints[i - axis].parent,
-                _ => i,
-            });
-        }
+        self.sums.descend::<W, false>(&slots.parents);
         for i in firsts::<S>(tree) {
+            let carrier = motion(self.sums.take_from::<W, BALLS>(i, &slots.carriers));
+            self.axis_rate.store::<S, W>(i, carrier.cross(self.axis.wide::<S, W>(i)));
+        }
+        for i in firsts_of_links::<S>(tree) {
             self.carry::<W, BALLS>(tree, poses, i);
         }
-        self.sums.ascend::<W, true>(tree);
+        self.sums.ascend::<W, true>(&slots.parents);
         for i in firsts::<S>(tree) {
-            let [n, f, moment] = self.sums.take_vectors::<W>(i);
+            let [n, f, moment] = self.sums.take_vectors_from::<W, BALLS>(i, &slots.links);
             self.momentum.store::<S, W>(i, Force { n, f });
             self.moment.store::<S, W>(i, moment);
         }
     }
 
-    /// Axes of the joints that begin with `i`, and how fast they move along them.
+    /// Axes in the slots that begin with `i`, and how fast links move along theirs.
     #[inline(always)]
-    fn place<W: Wide<S>>(&mut self, tree: &Tree, poses: &Poses<S>, velocity: &[S], i: usize) {
-        let (Pose { z, at, .. }, fixed) = (poses.wide::<W>(i), tree.fixed::<S, W>(i));
-        let kind = tree.joints[i].kind;
-        let axis = match kind {
+    fn place<W: Wide<S>, const BALLS: bool>(
+        &mut self,
+        tree: &Tree,
+        poses: &Poses<S>,
+        velocity: &[S],
+        i: usize,
+    ) {
+        let (pose, fixed) = (poses.wide::<W, BALLS>(tree, i), tree.fixed::<S, W>(i));
+        let Pose { x, y, z, at } = pose;
+        let axis = match tree.joints[tree.slots.joints[i]].kind {
             // Alone, a joint is of one kind.
             JointKind::Prismatic if S::BESIDE == 1 => Motion { w: Vec3::ZERO, v: z },
             JointKind::Revolute | JointKind::Ball(_) if S::BESIDE == 1 => {
@@ -179,27 +236,33 @@ impl<S: Scalar> Momenta<S> {
             }
         };
         self.axis.store::<S, W>(i, axis);
-        let speed = collect::<S, W>(tree, i, velocity);
-        let Motion { w: Vec3([p, q, r]), v: Vec3([x, y, z]) } = axis.scaled(speed);
+        if i >= tree.slots.parents.len() {
+            return;
+        }
+        let mut own = axis.scaled(collect(&tree.slots, i, velocity));
+        if BALLS {
+            let [_, first, second] = &tree.slots.coordinates;
+            let lanes = i..i + S::BESIDE;
+            let speeds: [W; 2] =
+                [collect_of(&first[lanes.clone()], velocity), collect_of(&second[lanes], velocity)];
+            let turn = x * speeds[0] + y * speeds[1];
+            own = Motion { w: own.w + turn, v: own.v + at.cross(turn) };
+        }
+        let Motion { w: Vec3([p, q, r]), v: Vec3([x, y, z]) } = own;
         self.sums.put(i, [p, q, r, x, y, z, W::ZERO, W::ZERO]);
     }
 
-    /// Rates of the axes, and momenta of the bodies, of the joints that begin with `i`.
+    /// Momenta of the bodies of the links that begin with `i`.
     #[inline(always)]
     fn carry<W: Wide<S>, const BALLS: bool>(&mut self, tree: &Tree, poses: &Poses<S>, i: usize) {
-        let motion =
-            |[p, q, r, x, y, z, ..]: [W; 8]| Motion { w: Vec3([p, q, r]), v: Vec3([x, y, z]) };
-        let (axis, twist) = (self.axis.wide::<S, W>(i), motion(self.sums.take(i)));
+        let twist = motion(self.sums.take(i));
         self.twist.store::<S, W>(i, twist);
-        // What an axis adds to the twist does not move it.
-        let carrier = if BALLS { motion(self.carriers.take(i)) } else { twist };
-        self.axis_rate.store::<S, W>(i, carrier.cross(axis));
         let rotational = tree.rotational::<S>(i);
         if let Rotational::None = rotational {
             self.sums.put_vectors(i, [Vec3::<W>::ZERO; 3]);
             return;
         }
-        let (pose, fixed) = (poses.wide::<W>(i), tree.fixed::<S, W>(i));
+        let (pose, fixed) = (poses.wide::<W, BALLS>(tree, i), tree.fixed::<S, W>(i));
         let rotation = pose.rotation();
         let center = pose.at + rotation.apply(fixed.center);
         let linear = twist.at(center) * fixed.mass;
@@ -221,7 +284,7 @@ impl<S: Scalar> Momenta<S> {
         let mut sum = S::ZERO;
         for (i, joint) in tree.joints.iter().enumerate() {
             sum +=
-                velocity[joint.coordinate] * self.axis.get::<S>(i).dot(self.momentum.get::<S>(i));
+                velocity[joint.coordinate] * self.axis_of(tree, i).dot(self.momentum_of(tree, i));
         }
         sum
     }
@@ -250,9 +313,9 @@ impl Momenta {
     pub(crate) fn totals(&self, tree: &Tree, poses: &Poses) -> Totals {
         let mut totals = Totals::default();
         for (i, joint) in tree.joints.iter().enumerate().filter(|(i, j)| j.root == *i) {
-            let (Force { n, f }, origin) = (self.momentum.get(i), poses.origin[i]);
+            let (Force { n, f }, origin) = (self.momentum_of(tree, i), poses.origin[i]);
             totals.momentum = totals.momentum.plus(Force { n: n + origin.cross(f), f });
-            totals.moment += self.moment.get::<f64>(i) + origin * joint.subtree_mass;
+            totals.moment += self.moment_of(tree, i) + origin * joint.subtree_mass;
             totals.mass += joint.subtree_mass;
         }
         totals

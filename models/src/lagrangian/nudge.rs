@@ -23,7 +23,8 @@ use crate::lagrangian::arrangement::Planar;
 use crate::lagrangian::curvature::Curvature;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::model::mechanism::Model;
-use crate::model::tree::{Joint, JointKind, WORLD};
+use crate::model::slots::Slots;
+use crate::model::tree::WORLD;
 
 /// A small change of the motion, and what it makes of the gradient.
 #[derive(Clone, Debug, Default)]
@@ -37,7 +38,7 @@ pub(crate) struct Nudge<S: Scalar = f64> {
     pub(crate) l_q: Vec<S>,
     /// `δL_v`, of ball joints alone.
     pub(crate) l_v: Vec<S>,
-    /// `E` and `G` of each joint.
+    /// `E` and `G` of each link.
     above: Vec<S::Row>,
     below: Vec<S::Row>,
 }
@@ -55,12 +56,13 @@ impl<S: Planar> Beside<S> for Find<'_, S> {
     #[inline(always)]
     fn run<W: Wide<S>>(self) {
         let Self { nudge, model, curvature } = self;
-        let joints = &model.dynamics.joints[..];
-        nudge.descend::<W>(joints, curvature);
+        let slots = &model.dynamics.slots;
         if model.orientations.is_empty() {
-            nudge.ascend::<W, false>(joints, curvature);
+            nudge.descend::<W, false>(slots, curvature);
+            nudge.ascend::<W, false>(slots, curvature);
         } else {
-            nudge.ascend::<W, true>(joints, curvature);
+            nudge.descend::<W, true>(slots, curvature);
+            nudge.ascend::<W, true>(slots, curvature);
         }
     }
 }
@@ -74,9 +76,9 @@ fn sum_of<S: Scalar, W: Wide<S>>([a, b]: [&S::Row; 2], [x, y]: [S; 2]) -> W::Lin
 impl<S: Planar> Nudge<S> {
     pub(crate) fn new(model: &Model) -> Self {
         let nd = model.dimensions.dynamic;
-        let (changes, joints) = match &model.planar {
+        let (changes, links) = match &model.planar {
             Some(_) => (model.dimensions.coordinates(), 0),
-            None => (nd, model.dynamics.joints.len()),
+            None => (nd, model.dynamics.slots.parents.len()),
         };
         let zeros = |count: usize| vec![S::ZERO; count];
         Self {
@@ -84,8 +86,8 @@ impl<S: Planar> Nudge<S> {
             velocity: zeros(changes),
             l_q: zeros(nd),
             l_v: zeros(if model.orientations.is_empty() { 0 } else { nd }),
-            above: vec![S::Row::default(); joints],
-            below: vec![S::Row::default(); joints],
+            above: vec![S::Row::default(); links],
+            below: vec![S::Row::default(); links],
         }
     }
 
@@ -115,61 +117,58 @@ impl<S: Planar> Nudge<S> {
         }
     }
 
-    /// `E`, from the roots to the leaves.
+    /// `E`, from the roots to the leaves; `BALLS`: some joint is a ball joint.
     #[inline(always)]
-    fn descend<W: Wide<S>>(&mut self, joints: &[Joint], curvature: &Curvature<S>) {
+    fn descend<W: Wide<S>, const BALLS: bool>(&mut self, slots: &Slots, curvature: &Curvature<S>) {
         let Curvature { axis, rate, .. } = curvature;
         let zero = W::row(&S::Row::default());
         let mut last = zero;
-        for (i, joint) in joints.iter().enumerate() {
-            let above = match joint.parent {
+        for (link, &parent) in slots.parents.iter().enumerate() {
+            let above = match parent {
                 WORLD => zero,
-                parent if parent + 1 == i => last,
+                parent if parent + 1 == link => last,
                 parent => W::row(&self.above[parent]),
             };
-            let own = self.own(joint.coordinate);
-            last = W::sum(above, sum_of::<S, W>([&rate[i], &axis[i]], own));
-            W::put_row(last, &mut self.above[i]);
-            self.below[i] = S::Row::default();
+            let (i, coordinate) = (slots.joints[link], slots.coordinates[0][link]);
+            let mut own = sum_of::<S, W>([&rate[i], &axis[i]], self.own(coordinate));
+            if BALLS && slots.is_ball(link) {
+                let [first, second] = [self.own(coordinate - 2), self.own(coordinate - 1)];
+                let first = sum_of::<S, W>([&rate[i - 2], &axis[i - 2]], first);
+                let second = sum_of::<S, W>([&rate[i - 1], &axis[i - 1]], second);
+                own = W::sum(own, W::sum(first, second));
+            }
+            last = W::sum(above, own);
+            W::put_row(last, &mut self.above[link]);
+            self.below[link] = S::Row::default();
         }
     }
 
-    /// `G` and the changes, from the leaves to the roots; `BALLS`: some joint is a ball joint.
+    /// `G` and the changes, from the leaves to the roots.
     #[inline(always)]
-    fn ascend<W: Wide<S>, const BALLS: bool>(
-        &mut self,
-        joints: &[Joint],
-        curvature: &Curvature<S>,
-    ) {
+    fn ascend<W: Wide<S>, const BALLS: bool>(&mut self, slots: &Slots, curvature: &Curvature<S>) {
         let Curvature { rate, force, slope, .. } = curvature;
         let zero = W::row(&S::Row::default());
-        // What the joint after this one passes on to it stays in registers.
+        // What the link after this one passes on to it stays in registers.
         let mut next = zero;
-        for (i, joint) in joints.iter().enumerate().rev() {
-            let children;
-            let first = match joint.kind {
-                JointKind::Ball(2) if BALLS => {
-                    children = W::sum(W::row(&self.below[i]), next);
-                    next = self.ascend_ball::<W>(i - 2, joint.coordinate - 2, children, curvature);
-                    i - 2
+        for (link, &parent) in slots.parents.iter().enumerate().rev() {
+            let (i, coordinate) = (slots.joints[link], slots.coordinates[0][link]);
+            let children = W::sum(W::row(&self.below[link]), next);
+            if BALLS && slots.is_ball(link) {
+                let moved = W::row(&self.above[link]);
+                let first = [i - 2, coordinate - 2];
+                next = self.ascend_ball::<W>(first, [moved, children], curvature);
+            } else {
+                let own = self.own(coordinate);
+                next = W::sum(children, sum_of::<S, W>([&slope[i], &force[i]], own));
+                if let Some(l_q) = self.l_q.get_mut(coordinate) {
+                    let above = match parent {
+                        WORLD => zero,
+                        parent => W::row(&self.above[parent]),
+                    };
+                    *l_q = W::dots([W::row(&slope[i]), above], [W::row(&rate[i]), next]);
                 }
-                JointKind::Ball(_) if BALLS => continue,
-                _ => {
-                    let own = self.own(joint.coordinate);
-                    children = W::sum(W::row(&self.below[i]), next);
-                    next = W::sum(children, sum_of::<S, W>([&slope[i], &force[i]], own));
-                    if let Some(l_q) = self.l_q.get_mut(joint.coordinate) {
-                        let above = match joint.parent {
-                            WORLD => zero,
-                            parent => W::row(&self.above[parent]),
-                        };
-                        *l_q = W::dots([W::row(&slope[i]), above], [W::row(&rate[i]), next]);
-                    }
-                    i
-                }
-            };
-            let parent = joints[first].parent;
-            if parent.wrapping_add(1) == first && first > 0 {
+            }
+            if parent.wrapping_add(1) == link && link > 0 {
                 continue;
             }
             if parent != WORLD {
@@ -180,18 +179,16 @@ impl<S: Planar> Nudge<S> {
         }
     }
 
-    /// The same for the axes of a ball joint, which begin with the joint `first` and the coordinate `own`;
-    /// returns what they and their children pass on.
+    /// The same for a ball joint, whose axes begin with the joint `first` and the coordinate `own`, from its own `E` and
+    /// from what its children pass on; returns what goes on to its parent.
     #[inline(always)]
     fn ascend_ball<W: Wide<S>>(
         &mut self,
-        first: usize,
-        own: usize,
-        children: W::Line,
+        [first, own]: [usize; 2],
+        [moved, children]: [W::Line; 2],
         curvature: &Curvature<S>,
     ) -> W::Line {
         let Curvature { axis, rate, force, slope, .. } = curvature;
-        let moved = W::row(&self.above[first + 2]);
         let (mut above, mut below, mut all) = (moved, children, children);
         for k in 0..3 {
             let [a, b] = self.own(own + k);

@@ -1,36 +1,43 @@
-//! Sums along a tree: what joints pass on to those that they carry, or to their parents.
+//! Sums along a tree: what links pass on to those that they carry, or to their parents.
 //!
-//! Of each joint the numbers that are summed up stand in a row, so that one addition does for eight of them; there
-//! are up to nine. From joints side by side to rows and back they are turned. A sum that the next joint takes stays
-//! in registers: through memory each joint would wait for the one before.
+//! Of each link the numbers that are summed up stand in a row, so that one addition does for eight of them; there
+//! are up to nine. From links side by side to rows and back they are turned. A sum that the next link takes stays
+//! in registers: through memory each link would wait for the one before.
 
 use plantd_math::scalar::{Scalar, Wide};
 use plantd_math::spatial::Vec3;
 
+use crate::model::slots::Slots;
 use crate::model::tree::{Tree, WORLD};
 
-/// Nine numbers of each joint.
+/// Nine numbers of each link.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Sums<S: Scalar> {
     rows: Vec<S::Row>,
     ninths: Vec<S::Several>,
 }
 
-/// Where joints begin that are side by side.
+/// Where slots begin that are side by side.
 #[inline(always)]
 pub(crate) fn firsts<S: Scalar>(tree: &Tree) -> impl Iterator<Item = usize> + use<S> {
     (0..tree.joints.len()).step_by(S::BESIDE)
 }
 
+/// The same of those that begin with a link.
+#[inline(always)]
+pub(crate) fn firsts_of_links<S: Scalar>(tree: &Tree) -> impl Iterator<Item = usize> + use<S> {
+    (0..tree.slots.parents.len()).step_by(S::BESIDE)
+}
+
 impl<S: Scalar> Sums<S> {
-    pub(crate) fn new(joints: usize) -> Self {
+    pub(crate) fn new(slots: &Slots) -> Self {
         Self {
-            rows: vec![S::Row::default(); joints.next_multiple_of(S::BESIDE)],
-            ninths: vec![S::Several::default(); joints.div_ceil(S::BESIDE)],
+            rows: vec![S::Row::default(); slots.nothing() + 1],
+            ninths: vec![S::Several::default(); slots.parents.len().div_ceil(S::BESIDE)],
         }
     }
 
-    /// Sets the first eight numbers of the joints that begin with `i`.
+    /// Sets the first eight numbers of the links that begin with `i`.
     #[inline(always)]
     pub(crate) fn put<W: Wide<S>>(&mut self, i: usize, numbers: [W; 8]) {
         W::spread(numbers, &mut self.rows[i..i + S::BESIDE]);
@@ -43,52 +50,59 @@ impl<S: Scalar> Sums<S> {
         c[2].store(&mut self.ninths[i / S::BESIDE]);
     }
 
-    /// The first eight sums of the joints that begin with `i`.
+    /// The first eight sums of the links that begin with `i`.
     #[inline(always)]
     pub(crate) fn take<W: Wide<S>>(&self, i: usize) -> [W; 8] {
         W::collect(&self.rows[i..i + S::BESIDE])
     }
 
-    /// All nine.
+    /// The same of the links that belong to the slots from `i` on; without ball joints they are the slots.
     #[inline(always)]
-    pub(crate) fn take_vectors<W: Wide<S>>(&self, i: usize) -> [Vec3<W>; 3] {
-        let [p, q, r, s, t, u, x, y] = self.take(i);
-        [Vec3([p, q, r]), Vec3([s, t, u]), Vec3([x, y, W::load(&self.ninths[i / S::BESIDE])])]
-    }
-
-    /// The first eight of each joint become those of another one, or zero.
-    #[inline(always)]
-    pub(crate) fn copy_from<W: Wide<S>>(&mut self, others: &Self, of: impl Fn(usize) -> usize) {
-        let zero = W::row(&S::Row::default());
-        for (i, row) in self.rows.iter_mut().enumerate() {
-            let other = match of(i) {
-                WORLD => zero,
-                other => W::row(&others.rows[other]),
-            };
-            W::put_row(other, row);
+    pub(crate) fn take_from<W: Wide<S>, const BALLS: bool>(
+        &self,
+        i: usize,
+        links: &[usize],
+    ) -> [W; 8] {
+        match BALLS {
+            true => W::collect_from(&self.rows, &links[i..i + S::BESIDE]),
+            false => self.take(i),
         }
     }
 
-    /// Each joint gets what its parent has; `NINTH`: also of the ninth numbers.
+    /// All nine.
     #[inline(always)]
-    pub(crate) fn descend<W: Wide<S>, const NINTH: bool>(&mut self, tree: &Tree) {
+    pub(crate) fn take_vectors_from<W: Wide<S>, const BALLS: bool>(
+        &self,
+        i: usize,
+        links: &[usize],
+    ) -> [Vec3<W>; 3] {
+        let [p, q, r, s, t, u, x, y] = self.take_from::<W, BALLS>(i, links);
+        let z = match BALLS {
+            true => W::load(&S::several(|lane| ninth::<S>(&self.ninths, links[i + lane]))),
+            false => W::load(&self.ninths[i / S::BESIDE]),
+        };
+        [Vec3([p, q, r]), Vec3([s, t, u]), Vec3([x, y, z])]
+    }
+
+    /// Each link gets what its parent has; `NINTH`: also of the ninth numbers.
+    #[inline(always)]
+    pub(crate) fn descend<W: Wide<S>, const NINTH: bool>(&mut self, parents: &[usize]) {
         let rows = &mut self.rows[..];
         let Some(first) = rows.first() else { return };
         let (mut last, mut last_ninth) = (W::row(first), S::ZERO);
-        for (i, joint) in tree.joints.iter().enumerate() {
+        for (i, &parent) in parents.iter().enumerate() {
             let mut sum = W::row(&rows[i]);
-            let is_next = joint.parent.wrapping_add(1) == i;
-            if joint.parent != WORLD {
-                let above = if is_next { last } else { W::row(&rows[joint.parent]) };
+            let is_next = parent.wrapping_add(1) == i;
+            if parent != WORLD {
+                let above = if is_next { last } else { W::row(&rows[parent]) };
                 sum = W::sum(above, sum);
                 W::put_row(sum, &mut rows[i]);
             }
             last = sum;
             if NINTH {
                 let mut sum = ninth::<S>(&self.ninths, i);
-                if joint.parent != WORLD {
-                    let above =
-                        if is_next { last_ninth } else { ninth::<S>(&self.ninths, joint.parent) };
+                if parent != WORLD {
+                    let above = if is_next { last_ninth } else { ninth::<S>(&self.ninths, parent) };
                     sum = above + sum;
                     sum.put(&mut self.ninths[i / S::BESIDE], i % S::BESIDE);
                 }
@@ -97,13 +111,13 @@ impl<S: Scalar> Sums<S> {
         }
     }
 
-    /// Each joint gets what its children have; `NINTH`: also of the ninth numbers.
+    /// Each link gets what its children have; `NINTH`: also of the ninth numbers.
     #[inline(always)]
-    pub(crate) fn ascend<W: Wide<S>, const NINTH: bool>(&mut self, tree: &Tree) {
+    pub(crate) fn ascend<W: Wide<S>, const NINTH: bool>(&mut self, parents: &[usize]) {
         let rows = &mut self.rows[..];
         let Some(first) = rows.first() else { return };
         let (mut below, mut below_ninth, mut is_followed) = (W::row(first), S::ZERO, false);
-        for (i, joint) in tree.joints.iter().enumerate().rev() {
+        for (i, &parent) in parents.iter().enumerate().rev() {
             let mut sum = W::row(&rows[i]);
             if is_followed {
                 sum = W::sum(sum, below);
@@ -118,9 +132,8 @@ impl<S: Scalar> Sums<S> {
                 }
                 below_ninth = sum;
             }
-            is_followed = joint.parent.wrapping_add(1) == i && i > 0;
-            if joint.parent != WORLD && !is_followed {
-                let parent = joint.parent;
+            is_followed = parent.wrapping_add(1) == i && i > 0;
+            if parent != WORLD && !is_followed {
                 let all = W::sum(W::row(&rows[parent]), below);
                 W::put_row(all, &mut rows[parent]);
                 if NINTH {

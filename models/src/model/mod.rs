@@ -13,4 +13,5 @@ pub(crate) mod mechanism;
 pub(crate) mod planar_tree;
 pub(crate) mod signal;
 pub(crate) mod site;
+pub(crate) mod slots;
 pub(crate) mod tree;

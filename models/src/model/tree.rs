@@ -6,6 +6,8 @@ use plantd_math::scalar::{Scalar, Wide};
 use plantd_math::sided::Composite;
 use plantd_math::spatial::{Mat3, Sym3, Vec3};
 
+use crate::model::slots::Slots;
+
 /// "No parent": the joint hangs from the world.
 pub(crate) const WORLD: usize = usize::MAX;
 
@@ -92,7 +94,9 @@ pub(crate) struct Tree {
     pub(crate) has_balls: bool,
     /// Some body is more than a point mass.
     has_spin: bool,
-    /// What is fixed to the joints, of eight side by side.
+    /// Where joints lie side by side.
+    pub(crate) slots: Slots,
+    /// What is fixed to the joints of eight slots.
     eights: Vec<Fixed<Block>>,
 }
 
@@ -110,9 +114,11 @@ pub(crate) struct Fixed<S> {
 }
 
 impl Fixed<Block> {
-    fn of(joints: &[Joint]) -> Self {
+    fn of(joints: &[Joint], slots: &[usize]) -> Self {
         let mut fixed = Self::default();
-        for (lane, joint) in joints.iter().enumerate() {
+        let joints = slots.iter().map(|slot| joints.get(*slot));
+        for (lane, joint) in joints.enumerate() {
+            let Some(joint) = joint else { continue };
             let (turns, slides) = match joint.kind {
                 JointKind::Prismatic => (0.0, 1.0),
                 JointKind::Screw(pitch) => (1.0, pitch),
@@ -140,10 +146,22 @@ impl Joint {
     pub(crate) fn follows(&self, i: usize) -> bool {
         self.parent.checked_add(1) == Some(i)
     }
+
+    /// The first axis of the joint that it is, or belongs to, where it is the one at `i`.
+    #[inline(always)]
+    pub(crate) fn first_axis(&self, i: usize) -> usize {
+        if let JointKind::Ball(axis) = self.kind { i - axis } else { i }
+    }
+
+    /// The last one, which has the body and carries others.
+    #[inline(always)]
+    pub(crate) fn last_axis(&self, i: usize) -> usize {
+        if let JointKind::Ball(axis) = self.kind { i + 2 - axis } else { i }
+    }
 }
 
 impl Tree {
-    /// What is fixed to the joints that begin with `i`, side by side.
+    /// What is fixed to the joints of the slots that begin with `i`.
     #[inline(always)]
     pub(crate) fn fixed<S: Scalar, W: Wide<S>>(&self, i: usize) -> Fixed<W> {
         let (eight, lane) = (&self.eights[i / LANES], i % LANES);
@@ -158,11 +176,11 @@ impl Tree {
         }
     }
 
-    /// What there is to know of the rotational inertia of the joints that begin with `i`: of several side by side, the
-    /// most that any has.
+    /// What there is to know of the rotational inertia in the slots that begin with `i`: of several, the most that any
+    /// has.
     #[inline(always)]
     pub(crate) fn rotational<S: Scalar>(&self, i: usize) -> Rotational {
-        match self.joints[i].body.inertia {
+        match self.joints[self.slots.joints[i]].body.inertia {
             inertia if S::BESIDE == 1 => inertia,
             _ if self.has_spin => Rotational::Full(Sym3::default()),
             _ => Rotational::Point,
@@ -187,8 +205,9 @@ impl Tree {
         let has_spin = joints.iter().any(|joint| {
             matches!(joint.body.inertia, Rotational::Isotropic(_) | Rotational::Full(_))
         });
-        let eights = joints.chunks(LANES).map(Fixed::of).collect();
-        let mut tree = Self { joints, has_other_joints, has_balls, has_spin, eights };
+        let slots = Slots::new(&joints);
+        let eights = slots.joints.chunks(LANES).map(|slots| Fixed::of(&joints, slots)).collect();
+        let mut tree = Self { joints, has_other_joints, has_balls, has_spin, slots, eights };
         tree.place_anchors();
         (tree, index)
     }
@@ -207,11 +226,8 @@ impl Tree {
     /// Whether two joints are axes of one ball joint.
     #[inline]
     pub(crate) fn one_ball(&self, i: usize, j: usize) -> bool {
-        let first = |joint: usize| match self.joints[joint].kind {
-            JointKind::Ball(axis) => Some(joint - axis),
-            _ => None,
-        };
-        self.has_other_joints && first(i).is_some() && first(i) == first(j)
+        let first = |joint: usize| self.joints[joint].first_axis(joint);
+        self.has_balls && i != j && first(i) == first(j)
     }
 
     fn place_anchors(&mut self) {

@@ -53,6 +53,10 @@ pub trait Wide<S: Scalar>: Scalar {
     fn spread(numbers: [Self; 8], rows: &mut [S::Row]);
     /// The way back.
     fn collect(rows: &[S::Row]) -> [Self; 8];
+    /// [`Wide::spread`] to the rows that are named.
+    fn spread_to(numbers: [Self; 8], rows: &mut [S::Row], of: &[usize]);
+    /// [`Wide::collect`] from the rows that are named.
+    fn collect_from(rows: &[S::Row], of: &[usize]) -> [Self; 8];
 }
 
 /// What is done with numbers side by side.
@@ -152,6 +156,14 @@ macro_rules! alone {
             #[inline(always)]
             fn collect(rows: &[[Self; 8]]) -> [Self; 8] {
                 rows[0]
+            }
+            #[inline(always)]
+            fn spread_to(numbers: [Self; 8], rows: &mut [[Self; 8]], of: &[usize]) {
+                rows[of[0]] = numbers;
+            }
+            #[inline(always)]
+            fn collect_from(rows: &[[Self; 8]], of: &[usize]) -> [Self; 8] {
+                rows[of[0]]
             }
         }
     };
@@ -339,12 +351,25 @@ impl<E: Eight, L: Eight> Wide<f64> for Sides<E, L> {
     }
     #[inline(always)]
     fn collect(rows: &[Block]) -> [Self; 8] {
-        let mut out = [Self::ZERO; 8];
-        for (out, own) in out.iter_mut().zip(E::collect(rows)) {
-            *out = Self::new(own);
-        }
-        out
+        of_eights(E::collect(rows))
     }
+    #[inline(always)]
+    fn spread_to([a, b, c, d, e, f, g, h]: [Self; 8], rows: &mut [Block], of: &[usize]) {
+        E::spread_to([a.0, b.0, c.0, d.0, e.0, f.0, g.0, h.0], rows, of);
+    }
+    #[inline(always)]
+    fn collect_from(rows: &[Block], of: &[usize]) -> [Self; 8] {
+        of_eights(E::collect_from(rows, of))
+    }
+}
+
+#[inline(always)]
+fn of_eights<E: Eight, L: Eight>(eights: [E; 8]) -> [Sides<E, L>; 8] {
+    let mut out = [Sides(E::ZERO, PhantomData); 8];
+    for (out, own) in out.iter_mut().zip(eights) {
+        *out = Sides::new(own);
+    }
+    out
 }
 
 /// Of plants side by side.
@@ -438,6 +463,14 @@ impl<E: Eight, L: Eight, const N: usize> Wide<LanesOf<N>> for Sides<E, L> {
     #[inline(always)]
     fn collect(rows: &[[LanesOf<N>; 8]]) -> [Self; 8] {
         <Self as Wide<LanesOf<N>>>::row(&rows[0])
+    }
+    #[inline(always)]
+    fn spread_to(numbers: [Self; 8], rows: &mut [[LanesOf<N>; 8]], of: &[usize]) {
+        <Self as Wide<LanesOf<N>>>::put_row(numbers, &mut rows[of[0]]);
+    }
+    #[inline(always)]
+    fn collect_from(rows: &[[LanesOf<N>; 8]], of: &[usize]) -> [Self; 8] {
+        <Self as Wide<LanesOf<N>>>::row(&rows[of[0]])
     }
 }
 

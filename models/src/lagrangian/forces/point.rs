@@ -16,7 +16,7 @@ use crate::lagrangian::forces::GeneralizedForce;
 use crate::lagrangian::instant::Instant;
 use crate::lagrangian::vectors::Separation;
 use crate::model::mechanism::{Carries, PathJoint, PointForce, PointLaw};
-use crate::model::tree::{Attachment, JointKind, WORLD};
+use crate::model::tree::{Attachment, WORLD};
 
 /// Points whose squared distance (m²) or speed (m²/s²) is below this coincide or rest: there is no
 /// force, and no derivative. Above it three derivatives of a root stay within the range of numbers.
@@ -147,7 +147,7 @@ impl PointForce {
         };
         let carried = twist(at, end);
         let turned =
-            at.momenta.axis.get::<S>(joint.joint).cross(carried.minus(before(at, joint.joint)));
+            at.momenta.axis_of(at.tree, joint.joint).cross(carried.minus(before(at, joint.joint)));
         let turned = turned.at(point);
         let turned = if joint.carries == Carries::A { turned } else { -turned };
         turned + carried.w.cross(gradient)
@@ -156,17 +156,14 @@ impl PointForce {
 
 /// Twist of what a point is fixed to.
 fn twist<S: Scalar>(at: &Instant<'_, S>, end: &Attachment) -> Motion<S> {
-    if end.joint == WORLD { Motion::default() } else { at.momenta.twist.get(end.joint) }
+    if end.joint == WORLD { Motion::default() } else { at.momenta.twist_of(at.tree, end.joint) }
 }
 
 /// Twist of what a joint hangs from; for an axis of a ball joint, what the whole joint hangs from.
 fn before<S: Scalar>(at: &Instant<'_, S>, joint: usize) -> Motion<S> {
-    let first = match at.tree.joints[joint].kind {
-        JointKind::Ball(axis) => joint - axis,
-        _ => joint,
-    };
-    match at.tree.joints[first].parent {
+    let joints = &at.tree.joints;
+    match joints[joints[joint].first_axis(joint)].parent {
         WORLD => Motion::default(),
-        parent => at.momenta.twist.get(parent),
+        parent => at.momenta.twist_of(at.tree, parent),
     }
 }

@@ -52,7 +52,7 @@ impl GeneralizedForce for Wrench {
         let wrench = self.total(at);
         for &joint in &self.path {
             if let Some(entry) = force.get_mut(at.tree.joints[joint].coordinate) {
-                *entry += at.momenta.axis.get::<S>(joint).dot(wrench);
+                *entry += at.momenta.axis_of(at.tree, joint).dot(wrench);
             }
         }
     }
@@ -65,10 +65,10 @@ impl GeneralizedForce for Wrench {
         let wrench = self.total(at);
         let (point, _) = at.poses.point(at.tree, &self.at);
         for &column in &self.path {
-            let below = at.momenta.axis.get::<S>(column);
+            let below = at.momenta.axis_of(at.tree, column);
             let moved = at.poses.point_gradient(at.tree, column, point).cross(wrench.f);
             for &row in &self.path {
-                let axis = at.momenta.axis.get::<S>(row);
+                let axis = at.momenta.axis_of(at.tree, row);
                 let row_turns = row >= column || at.tree.one_ball(row, column);
                 let turned = match self.kind {
                     WrenchKind::Body if row_turns => continue,
@@ -95,7 +95,7 @@ impl GeneralizedForce for Wrench {
         for (input, unit) in &self.inputs {
             let wrench = self.in_world(at, lift(unit));
             for &joint in &self.path {
-                let by_u = at.momenta.axis.get::<S>(joint).dot(wrench);
+                let by_u = at.momenta.axis_of(at.tree, joint).dot(wrench);
                 entry(at.tree.joints[joint].coordinate, *input, by_u);
             }
         }
