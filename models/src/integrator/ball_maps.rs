@@ -1,6 +1,6 @@
 //! The maps of all ball joints of a step, eight side by side.
 
-use plantd_math::rotation::{Quaternion, Turn};
+use plantd_math::rotation::{Chart, Quaternion, Turn};
 use plantd_math::rows::Block;
 use plantd_math::scalar::{Beside, Scalar, Wide, alone};
 use plantd_math::sided::{Composite, Sided};
@@ -151,6 +151,40 @@ impl Beside<f64> for ToMidpoint<'_> {
             put(own, turn);
             let all = wide::<W, _>(start).times(&own.half());
             each(&all, middle.len(), |lane, matrix| middle[lane] = matrix);
+        }
+    }
+}
+
+/// Momenta half-way, `Λ` of [collocation](crate::integrator::collocation::balls).
+pub(crate) struct CarryOn<'a> {
+    /// Where the momenta are, and what is below.
+    pub(crate) coordinates: &'a [usize],
+    pub(crate) places: &'a [usize],
+    pub(crate) turns: &'a Sided<Turn<Block>>,
+    /// At the start, and what they lost to rounding.
+    pub(crate) momenta: [&'a [f64]; 2],
+    /// `T`.
+    pub(crate) total: &'a [f64],
+    /// `Λ`.
+    pub(crate) carried: &'a mut [f64],
+}
+
+impl Beside<f64> for CarryOn<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<W: Wide<f64>>(self) {
+        let Self { coordinates, places, turns, momenta: [p, low], total, carried } = self;
+        let groups = coordinates.chunks(BESIDE).zip(places.chunks(BESIDE));
+        for ((coordinates, places), turn) in groups.zip(&turns.0) {
+            let turn: Turn<W> = wide::<W, _>(turn);
+            let p = collect(coordinates, p, Vec3::default());
+            let low = collect(coordinates, low, Vec3::default());
+            let total = collect(places, total, Vec3::default());
+            let start = turn.torque_to_start(total).scaled(0.5) + low + p;
+            let mut lanes = Vec3::default();
+            put(Chart::new(turn.xi).dexp().apply(start), &mut lanes);
+            scatter(places, &lanes, carried);
         }
     }
 }

@@ -126,12 +126,12 @@ impl<S: Scalar> Poses<S> {
         if S::BESIDE > 1 {
             return self.sides.wide::<S, W>(i);
         }
-        let joint = tree.slots.joints[i];
-        let mut pose = self.pose(tree.joints[joint].last_axis(joint));
-        if BALLS {
-            pose.z = self.axis(tree, joint);
+        if !BALLS {
+            return self.pose(i).map(W::of_one);
         }
-        pose.map(W::of_one)
+        let [joint, axis] = tree.slots.poses[i];
+        let z = self.rotation[joint].0[axis];
+        Pose { z, ..self.pose(joint) }.map(W::of_one)
     }
 
     #[inline(always)]

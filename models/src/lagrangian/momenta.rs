@@ -240,7 +240,7 @@ impl<S: Scalar> Momenta<S> {
             return;
         }
         let mut own = axis.scaled(collect(&tree.slots, i, velocity));
-        if BALLS {
+        if BALLS && (S::BESIDE > 1 || tree.slots.is_ball(i)) {
             let [_, first, second] = &tree.slots.coordinates;
             let lanes = i..i + S::BESIDE;
             let speeds: [W; 2] =

@@ -19,6 +19,8 @@ pub(crate) struct Slots {
     pub(crate) parents: Vec<usize>,
     /// The joint of each slot; beyond the last, the slot itself.
     pub(crate) joints: Vec<usize>,
+    /// At which joint the pose of each slot is, and which axis of it is that of the slot.
+    pub(crate) poses: Vec<[usize; 2]>,
     /// The link of each slot.
     pub(crate) links: Vec<usize>,
     /// The link that carries the axis of each slot, or [`Slots::nothing`]: an axis turns with what a ball joint hangs
@@ -62,7 +64,12 @@ impl Slots {
             _ => NONE,
         };
         let by_slot = |f: &dyn Fn(usize) -> usize| order.iter().map(|joint| f(*joint)).collect();
+        let pose = |joint: usize| match joints[joint].kind {
+            JointKind::Ball(axis) => [joint + 2 - axis, axis],
+            _ => [joint, 2],
+        };
         Self {
+            poses: order.iter().map(|joint| pose(*joint)).collect(),
             parents: order[..links].iter().map(|joint| above(*joint)).collect(),
             links: padded(by_slot(&link), &|_| 0),
             carriers: padded(by_slot(&carrier), &|_| nothing),

@@ -31,10 +31,13 @@
 //! collocation: the order is `2s`.
 
 use plantd_math::rotation::{Chart, Turn};
+use plantd_math::rows::Block;
 use plantd_math::scalar::{Lanes, LanesOf, Scalar, Side};
+use plantd_math::sided::Sided;
 use plantd_math::simd::wide;
 use plantd_math::spatial::{Mat3, Vec3, three};
 
+use crate::integrator::ball_maps::{CarryOn, ToMatrices, ToMidpoint, beside};
 use crate::integrator::scheme::Tableau;
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::Workspace;
@@ -52,18 +55,23 @@ pub(crate) struct Balls {
     width: usize,
     /// `σ_ij`, column after column, padded.
     skew: Vec<Lanes>,
-    /// Orientations at the start and half-way, and how they turn.
+    /// Orientations at the start and half-way, and how they turn: side by side, by the `places` in `sums`.
     start: Vec<Mat3>,
+    start_beside: Sided<Mat3<Block>>,
     centers: Vec<Mat3>,
-    turns: Vec<Turn>,
+    turns: Sided<Turn<Block>>,
+    places: Vec<usize>,
+    /// `ξ`.
+    turn: Vec<f64>,
+    /// `T`, and `Λ`.
+    total: Vec<f64>,
+    carried: Vec<f64>,
     /// Of each four stages, joint after joint: orientations, charts, `V`.
     orientations: Vec<Mat3<Lanes>>,
     charts: Vec<Chart<Lanes>>,
     rates: Vec<Vec3<Lanes>>,
     /// `h b_i exp(η) (τ + f)`, as numbers of coordinates are.
     torque: Vec<f64>,
-    /// `Λ`.
-    carried: Vec<Vec3>,
     /// With constraints.
     nodes: Option<Box<Nodes>>,
 }
@@ -84,8 +92,11 @@ struct Nodes {
 /// The numbers of the three coordinates of a joint, of four stages.
 #[inline(always)]
 fn load(numbers: &[f64], coordinate: usize, width: usize, first: usize) -> Vec3<Lanes> {
-    let of = |a: usize| Lanes::load(&numbers[(coordinate + a) * width + first..]);
-    Vec3([of(0), of(1), of(2)])
+    let mut all = [Lanes::ZERO; 3];
+    for (a, own) in all.iter_mut().enumerate() {
+        *own = Lanes::load(&numbers[(coordinate + a) * width + first..]);
+    }
+    Vec3(all)
 }
 
 #[inline(always)]
@@ -118,13 +129,17 @@ impl Balls {
                 .map(|(i, j)| LanesOf([0, 1, 2, 3].map(|lane| entry(i + lane, j))))
                 .collect(),
             start: vec![Mat3::IDENTITY; no],
+            start_beside: Sided(vec![Mat3([Vec3::default(); 3]); no.div_ceil(f64::BESIDE)]),
             centers: vec![Mat3::IDENTITY; no],
-            turns: vec![Turn::new(Vec3::ZERO); no],
+            turns: Sided::zeros::<f64>(no),
+            places: (0..no).map(|o| 3 * o).collect(),
+            turn: vec![0.0; 3 * no],
+            total: vec![0.0; 3 * no],
+            carried: vec![0.0; 3 * no],
             orientations: vec![Mat3::IDENTITY; stages],
             charts: vec![Chart::new(Vec3::ZERO); stages],
             rates: vec![Vec3::ZERO; stages],
             torque: vec![0.0; 3 * no * width],
-            carried: vec![Vec3::ZERO; no],
             nodes: (model.dimensions.constraints > 0).then(|| {
                 Box::new(Nodes {
                     skew: tableau.reach_from_middle.clone(),
@@ -139,9 +154,9 @@ impl Balls {
 
     /// Starts at a state: `increment` has `h b_i ω_i`, and gets the `Y_i` that belong to them.
     pub(super) fn begin(&mut self, state: &PreciseState, increment: &mut [f64]) {
-        for (start, orientation) in self.start.iter_mut().zip(&state.orientations) {
-            *start = orientation.matrix();
-        }
+        let orientations = &state.orientations[..];
+        let (matrices, sides) = (&mut self.start[..], &mut self.start_beside);
+        beside(orientations.len(), ToMatrices { orientations, matrices, beside: sides });
         let (width, groups) = (self.width, self.groups());
         for &c in &self.coordinates {
             let mut turned = [Vec3::ZERO; 2];
@@ -167,15 +182,14 @@ impl Balls {
     #[inline(always)]
     fn offset(&self, numbers: &[f64], coordinate: usize, g: usize) -> Vec3<Lanes> {
         let (width, groups) = (self.width, self.groups());
-        let of = |a: usize| {
-            let mut sum = Lanes::ZERO;
+        let mut sums = [Lanes::ZERO; 3];
+        for (a, sum) in sums.iter_mut().enumerate() {
             let numbers = &numbers[(coordinate + a) * width..][..self.count];
             for (column, x) in self.skew.chunks_exact(groups).zip(numbers) {
-                sum += column[g] * *x;
+                *sum += column[g] * *x;
             }
-            sum
-        };
-        Vec3([of(0), of(1), of(2)])
+        }
+        Vec3(sums)
     }
 
     /// Orientations of four stages.
@@ -234,11 +248,14 @@ impl Balls {
         if let Some(nodes) = &mut self.nodes {
             nodes.torque.fill(Vec3::ZERO);
         }
-        for (o, &c) in self.coordinates.iter().enumerate() {
-            let sum = |a: usize| increment[(c + a) * self.width..][..self.count].iter().sum();
-            self.turns[o] = Turn::new(Vec3([sum(0), sum(1), sum(2)]));
-            self.centers[o] = self.start[o].times(&self.turns[o].half());
+        for (&c, turn) in self.coordinates.iter().zip(self.turn.as_chunks_mut::<3>().0) {
+            for (a, turn) in turn.iter_mut().enumerate() {
+                *turn = increment[(c + a) * self.width..][..self.count].iter().sum();
+            }
         }
+        let Self { places, turn, start_beside: start, turns, centers, .. } = self;
+        let (coordinates, increment, middle) = (&places[..], &turn[..], &mut centers[..]);
+        beside(places.len(), ToMidpoint { coordinates, increment, start, turns, middle });
     }
 
     /// Moves to four stages; writes `η` and `ω` in place of coordinates and velocities.
@@ -287,11 +304,20 @@ impl Balls {
         })
     }
 
-    /// `ΣT` of a joint.
-    fn total(&self, o: usize) -> Vec3 {
-        let sum = |a: usize| self.torque[(3 * o + a) * self.width..][..self.count].iter().sum();
-        let of_stages = Vec3([sum(0), sum(1), sum(2)]);
-        self.nodes.as_deref().map_or(of_stages, |nodes| of_stages + nodes.torque[o])
+    /// Finds `T` and `Λ`.
+    fn carry(&mut self, state: &PreciseState) {
+        for (o, total) in self.total.as_chunks_mut::<3>().0.iter_mut().enumerate() {
+            for (a, total) in total.iter_mut().enumerate() {
+                *total = self.torque[(3 * o + a) * self.width..][..self.count].iter().sum();
+            }
+            if let Some(nodes) = &self.nodes {
+                *total = (Vec3(*total) + nodes.torque[o]).0;
+            }
+        }
+        let Self { coordinates, places, turns, total, carried, .. } = self;
+        let momenta = [&state.p[..], &state.p_low[..]];
+        let task = CarryOn { coordinates, places, turns, momenta, total, carried };
+        beside(places.len(), task);
     }
 
     /// Writes the residuals of ball joints.
@@ -301,14 +327,10 @@ impl Balls {
         [impulse, momentum]: [&[f64]; 2],
         residual: &mut [f64],
     ) {
+        self.carry(state);
         wide!({
             for o in 0..self.coordinates.len() {
-                let c = self.coordinates[o];
-                let (p, low) = (three(&state.p, c), three(&state.p_low, c));
-                let turn = &self.turns[o];
-                let at_start = turn.torque_to_start(self.total(o)) * 0.5 + low + p;
-                let carried = Chart::new(turn.xi).dexp().apply(at_start);
-                self.carried[o] = carried;
+                let (c, carried) = (self.coordinates[o], three(&self.carried, 3 * o));
                 for g in 0..self.groups() {
                     let first = g * Lanes::COUNT;
                     let own = self.offset(impulse, c, g) + Vec3::lift(carried)
@@ -338,7 +360,9 @@ impl Balls {
     /// Writes the impulses `p[k+1] − p` of ball joints.
     pub(super) fn finish(&self, impulse: &mut [f64]) {
         for (o, &c) in self.coordinates.iter().enumerate() {
-            let change = self.total(o) + self.carried[o].cross(self.turns[o].xi);
+            let [turn, total, carried] =
+                [&self.turn, &self.total, &self.carried].map(|list| three(list, 3 * o));
+            let change = total + carried.cross(turn);
             impulse[c..c + 3].copy_from_slice(&change.0);
         }
     }

@@ -8,6 +8,8 @@
 //!
 //! which is Newton's method as far as the past rounds know the Jacobian.
 
+use plantd_math::simd::wide;
+
 /// Rounds that count.
 const DEPTH: usize = 16;
 /// Of a column of `ΔF`, what must be left beside the others, squared.
@@ -29,6 +31,7 @@ pub(crate) struct Secants {
     products: [[f64; DEPTH]; DEPTH],
 }
 
+#[inline(always)]
 fn dot(a: &[f64], b: &[f64]) -> f64 {
     let (a, b) = (a.as_chunks::<8>(), b.as_chunks::<8>());
     let mut sums = [0.0; 8];
@@ -62,66 +65,78 @@ impl Secants {
 
     /// Replaces a correction by a better one.
     pub(crate) fn improve(&mut self, correction: &mut [f64]) {
-        let size = self.size;
-        if self.seen > 0 {
+        wide!({
+            self.note(correction);
+            let known = self.seen.min(DEPTH);
+            if known > 0 {
+                let weights = self.weights(known, correction);
+                for (moved, weight) in self.moved.chunks_exact(self.size).zip(weights) {
+                    if weight != 0.0 {
+                        correction.iter_mut().zip(moved).for_each(|(c, m)| *c -= weight * m);
+                    }
+                }
+            }
+            self.step.copy_from_slice(correction);
+            self.seen += 1;
+        })
+    }
+
+    /// What the last step has made of the correction.
+    #[inline(always)]
+    fn note(&mut self, correction: &[f64]) {
+        let (size, known) = (self.size, self.seen.min(DEPTH));
+        if known > 0 {
             let own = (self.seen - 1) % DEPTH;
             let changed = &mut self.changed[own * size..][..size];
             let moved = &mut self.moved[own * size..][..size];
-            for (i, changed) in changed.iter_mut().enumerate() {
-                *changed = correction[i] - self.last[i];
-                moved[i] = self.step[i] + *changed;
+            let before = correction.iter().zip(self.last.iter().zip(&self.step));
+            for ((correction, (last, step)), (changed, moved)) in
+                before.zip(changed.iter_mut().zip(moved))
+            {
+                *changed = correction - last;
+                *moved = step + *changed;
+            }
+            let changed = &self.changed[own * size..][..size];
+            for k in 0..known {
+                let product = dot(changed, &self.changed[k * size..][..size]);
+                (self.products[own][k], self.products[k][own]) = (product, product);
             }
         }
         self.last.copy_from_slice(correction);
-        let known = self.seen.min(DEPTH);
-        if known > 0 {
-            let own = (self.seen - 1) % DEPTH;
-            for k in 0..known {
-                let product =
-                    dot(&self.changed[own * size..][..size], &self.changed[k * size..][..size]);
-                (self.products[own][k], self.products[k][own]) = (product, product);
-            }
-            let weights = self.weights(known, correction);
-            for (k, weight) in weights.iter().enumerate().take(known).filter(|(_, w)| **w != 0.0) {
-                let moved = &self.moved[k * size..][..size];
-                correction.iter_mut().zip(moved).for_each(|(c, m)| *c -= weight * m);
-            }
-        }
-        self.step.copy_from_slice(correction);
-        self.seen += 1;
     }
 
     /// `γ`, by the normal equations, newest rounds first; those that say nothing new have none.
+    #[inline(always)]
     fn weights(&self, known: usize, correction: &[f64]) -> [f64; DEPTH] {
         let newest = self.seen - 1;
         let place = |k: usize| (newest - k) % DEPTH;
         let mut matrix = [[0.0; DEPTH]; DEPTH];
-        let mut right = [0.0; DEPTH];
-        let mut counts = [false; DEPTH];
+        let [mut right, mut whole, mut inverse, mut weights] = [[0.0; DEPTH]; 4];
         for i in 0..known {
-            for (j, entry) in matrix[i].iter_mut().enumerate().take(known) {
+            for (j, entry) in matrix[i].iter_mut().enumerate().take(known).skip(i) {
                 *entry = self.products[place(i)][place(j)];
             }
-            let changed = &self.changed[place(i) * self.size..][..self.size];
-            right[i] = dot(changed, correction);
+            whole[i] = matrix[i][i];
+            right[i] = dot(&self.changed[place(i) * self.size..][..self.size], correction);
         }
-        // L D Lᵀ; a column that depends on those before is left out.
-        for i in 0..known {
-            let whole = matrix[i][i];
-            for k in (0..i).filter(|k| counts[*k]) {
-                let factor = matrix[i][k] / matrix[k][k];
-                for row in &mut matrix[i..known] {
-                    row[i] -= factor * row[k];
+        // L D Lᵀ, by the rows of Lᵀ; a column that depends on those before is left out.
+        for k in (0..known).filter(|k| whole[*k] > 0.0) {
+            if matrix[k][k] <= LEFT * whole[k] {
+                continue;
+            }
+            let row = matrix[k];
+            inverse[k] = 1.0 / row[k];
+            for i in k + 1..known {
+                let factor = row[i] * inverse[k];
+                for (entry, above) in matrix[i].iter_mut().zip(row).take(known).skip(i) {
+                    *entry -= factor * above;
                 }
                 right[i] -= factor * right[k];
             }
-            counts[i] = matrix[i][i] > LEFT * whole;
         }
-        let mut weights = [0.0; DEPTH];
-        for i in (0..known).rev().filter(|i| counts[*i]) {
-            let below = (i + 1..known).filter(|j| counts[*j]);
-            let rest: f64 = below.map(|j| matrix[j][i] * weights[place(j)]).sum();
-            weights[place(i)] = (right[i] - rest) / matrix[i][i];
+        for i in (0..known).rev() {
+            let rest: f64 = (i + 1..known).map(|j| matrix[i][j] * weights[place(j)]).sum();
+            weights[place(i)] = (right[i] - rest) * inverse[i];
         }
         weights
     }
