@@ -18,15 +18,16 @@ const LEFT: f64 = 1e-12;
 /// The past rounds of a step.
 #[derive(Clone, Debug)]
 pub(crate) struct Secants {
-    size: usize,
     /// Rounds seen.
     seen: usize,
-    /// `ΔY + ΔF` and `ΔF` of each round in its turn, one after the other.
+    /// `ΔY + ΔF` of each round in its turn, one after the other.
     moved: Vec<f64>,
-    changed: Vec<f64>,
-    /// The last correction, and the step that was made of it.
+    /// `ΔF` of all rounds, number by number.
+    changed: Vec<[[f64; 8]; DEPTH / 8]>,
+    /// The last correction, the step that was made of it, and its change.
     last: Vec<f64>,
     step: Vec<f64>,
+    change: Vec<f64>,
     /// `ΔFᵀ ΔF`.
     products: [[f64; DEPTH]; DEPTH],
 }
@@ -48,12 +49,12 @@ impl Secants {
     pub(crate) fn new(size: usize) -> Self {
         let zeros = |len: usize| vec![0.0; len];
         Self {
-            size,
             seen: 0,
             moved: zeros(DEPTH * size),
-            changed: zeros(DEPTH * size),
+            changed: vec![[[0.0; 8]; DEPTH / 8]; size],
             last: zeros(size),
             step: zeros(size),
+            change: zeros(size),
             products: [[0.0; DEPTH]; DEPTH],
         }
     }
@@ -66,11 +67,13 @@ impl Secants {
     /// Replaces a correction by a better one.
     pub(crate) fn improve(&mut self, correction: &mut [f64]) {
         wide!({
-            self.note(correction);
             let known = self.seen.min(DEPTH);
-            if known > 0 {
-                let weights = self.weights(known, correction);
-                for (moved, weight) in self.moved.chunks_exact(self.size).zip(weights) {
+            if known == 0 {
+                self.last.copy_from_slice(correction);
+            } else {
+                let right = self.note(known, correction);
+                let weights = self.weights(known, right);
+                for (moved, weight) in self.moved.chunks_exact(correction.len()).zip(weights) {
                     if weight != 0.0 {
                         correction.iter_mut().zip(moved).for_each(|(c, m)| *c -= weight * m);
                     }
@@ -81,56 +84,82 @@ impl Secants {
         })
     }
 
-    /// What the last step has made of the correction.
+    /// Takes note of what the last step has made of the correction; returns `ΔFᵀ f`.
     #[inline(always)]
-    fn note(&mut self, correction: &[f64]) {
-        let (size, known) = (self.size, self.seen.min(DEPTH));
-        if known > 0 {
-            let own = (self.seen - 1) % DEPTH;
-            let changed = &mut self.changed[own * size..][..size];
-            let moved = &mut self.moved[own * size..][..size];
-            let before = correction.iter().zip(self.last.iter().zip(&self.step));
-            for ((correction, (last, step)), (changed, moved)) in
-                before.zip(changed.iter_mut().zip(moved))
-            {
-                *changed = correction - last;
-                *moved = step + *changed;
-            }
-            let changed = &self.changed[own * size..][..size];
-            for k in 0..known {
-                let product = dot(changed, &self.changed[k * size..][..size]);
-                (self.products[own][k], self.products[k][own]) = (product, product);
-            }
+    fn note(&mut self, known: usize, correction: &[f64]) -> [f64; DEPTH] {
+        let (size, own) = (correction.len(), (self.seen - 1) % DEPTH);
+        let moved = &mut self.moved[own * size..][..size];
+        let before = self.last.iter_mut().zip(&self.step);
+        let after = self.change.iter_mut().zip(moved);
+        for ((new, (last, step)), (change, moved)) in correction.iter().zip(before).zip(after) {
+            *change = new - *last;
+            *moved = step + *change;
+            *last = *new;
         }
-        self.last.copy_from_slice(correction);
+        let [mut products, mut right] = match known {
+            ..=8 => self.take_products::<1>(own, correction),
+            _ => self.take_products::<{ DEPTH / 8 }>(own, correction),
+        };
+        products[own] = dot(&self.change, &self.change);
+        right[own] = dot(&self.change, correction);
+        self.products[own] = products;
+        for (row, product) in self.products.iter_mut().zip(products) {
+            row[own] = product;
+        }
+        right
+    }
+
+    /// The products of all `ΔF` with the last one, which is put to them, and with the correction; of its own with
+    /// itself they are those of what was in its place.
+    #[inline(always)]
+    fn take_products<const BLOCKS: usize>(
+        &mut self,
+        own: usize,
+        correction: &[f64],
+    ) -> [[f64; DEPTH]; 2] {
+        let mut sums = [[[0.0; 8]; DEPTH / 8]; 2];
+        for ((row, change), new) in self.changed.iter_mut().zip(&self.change).zip(correction) {
+            for b in 0..BLOCKS {
+                for lane in 0..8 {
+                    sums[0][b][lane] += row[b][lane] * change;
+                    sums[1][b][lane] += row[b][lane] * new;
+                }
+            }
+            row[own / 8][own % 8] = *change;
+        }
+        let [products, right] = &sums;
+        let mut all = [[0.0; DEPTH]; 2];
+        all[0].copy_from_slice(products.as_flattened());
+        all[1].copy_from_slice(right.as_flattened());
+        all
     }
 
     /// `γ`, by the normal equations, newest rounds first; those that say nothing new have none.
     #[inline(always)]
-    fn weights(&self, known: usize, correction: &[f64]) -> [f64; DEPTH] {
+    fn weights(&self, known: usize, products: [f64; DEPTH]) -> [f64; DEPTH] {
         let newest = self.seen - 1;
         let place = |k: usize| (newest - k) % DEPTH;
         let mut matrix = [[0.0; DEPTH]; DEPTH];
         let [mut right, mut whole, mut inverse, mut weights] = [[0.0; DEPTH]; 4];
         for i in 0..known {
-            for (j, entry) in matrix[i].iter_mut().enumerate().take(known).skip(i) {
-                *entry = self.products[place(i)][place(j)];
+            let row = &self.products[place(i)];
+            for (j, entry) in matrix[i].iter_mut().enumerate().take(known) {
+                *entry = row[place(j)];
             }
             whole[i] = matrix[i][i];
-            right[i] = dot(&self.changed[place(i) * self.size..][..self.size], correction);
+            right[i] = products[place(i)];
         }
         // L D Lᵀ, by the rows of Lᵀ; a column that depends on those before is left out.
-        for k in (0..known).filter(|k| whole[*k] > 0.0) {
-            if matrix[k][k] <= LEFT * whole[k] {
+        for k in 0..known {
+            let row = matrix[k];
+            // Not where it is not a number.
+            if !(row[k] > LEFT * whole[k]) {
                 continue;
             }
-            let row = matrix[k];
             inverse[k] = 1.0 / row[k];
             for i in k + 1..known {
                 let factor = row[i] * inverse[k];
-                for (entry, above) in matrix[i].iter_mut().zip(row).take(known).skip(i) {
-                    *entry -= factor * above;
-                }
+                matrix[i].iter_mut().zip(row).for_each(|(entry, above)| *entry -= factor * above);
                 right[i] -= factor * right[k];
             }
         }

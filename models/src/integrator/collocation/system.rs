@@ -594,12 +594,9 @@ impl System {
     ) -> Option<Result<StepReport, StepError>> {
         let StepContext { settings, state, .. } = at;
         let mut alike = self.alike.take()?;
-        let enough = match settings.precision {
-            Precision::Exact => settings.precision.residual(),
-            Precision::Fast | Precision::Coarse => settings.precision.residual() * OF_LIGHT_BODIES,
-        };
+        let enough = settings.precision.residual();
         let mut report = StepReport::default();
-        let (mut previous, mut sluggish) = (f64::INFINITY, 0);
+        let (mut previous, mut moved_before, mut sluggish) = (f64::INFINITY, f64::INFINITY, 0);
         let mut is_solved = false;
         for iteration in 1..=settings.max_iterations {
             report.iterations = iteration;
@@ -609,22 +606,29 @@ impl System {
             if !size.is_finite() {
                 break;
             }
-            let left = match settings.precision {
-                // What the correction will leave.
-                Precision::Fast | Precision::Coarse if iteration > 1 => {
-                    size * (size / previous).min(1.0)
-                }
-                _ => size,
-            };
             if iteration == 1 {
                 report.factorizations = 1;
                 if !self.factor_alike(&mut alike, workspace, at, inputs) {
                     break;
                 }
             }
-            self.correct_with(workspace, at.model, &mut alike, iteration == 1);
+            let moved = self.correct_with(workspace, at.model, &mut alike, iteration == 1);
             (report.residual, report.constraint_residual) = (residual, violation);
-            if left <= enough || (size > SLOW * previous && size <= CHORD_FLOOR) {
+            let is_enough = match settings.precision {
+                Precision::Exact => size <= enough,
+                Precision::Fast | Precision::Coarse => {
+                    // What the correction leaves, of the increments or of the residual.
+                    let unit = f64::EPSILON * largest(&self.increment);
+                    let falls = |now: f64, before: f64| match before.is_finite() {
+                        true => now * (now / before).min(1.0),
+                        false => now,
+                    };
+                    falls(moved, moved_before) <= enough * unit
+                        || falls(size, previous) <= enough * OF_LIGHT_BODIES
+                }
+            };
+            moved_before = moved;
+            if is_enough || (size > SLOW * previous && size <= CHORD_FLOOR) {
                 if size > STALE {
                     self.evaluate(workspace, at, inputs);
                     self.find_residuals(state);
@@ -685,14 +689,14 @@ impl System {
         masses.factor(at.model);
     }
 
-    /// Corrects the increments, and the impulses of constraints.
+    /// Corrects the increments, and the impulses of constraints; returns the largest change of an increment.
     fn correct_with(
         &mut self,
         workspace: &mut Workspace,
         model: &Model,
         alike: &mut Alike,
         is_first: bool,
-    ) {
+    ) -> f64 {
         let changes = match (alike, &mut self.closures) {
             (Alike::Middle(middle), Some(closures)) => {
                 middle.correct(workspace, model, closures, &self.residual, is_first)
@@ -701,12 +705,14 @@ impl System {
                 self.change_by_masses(model, masses, is_first);
                 &self.residual
             }
-            (Alike::Middle(_), None) => return,
+            (Alike::Middle(_), None) => return 0.0,
         };
+        let moved = largest(changes);
         let changes = changes.chunks_exact(self.count);
         for (own, changes) in self.increment.chunks_exact_mut(self.width).zip(changes) {
             own.iter_mut().zip(changes).for_each(|(y, change)| *y += change);
         }
+        moved
     }
 
     /// From the residuals to changes of the increments, with the mass matrices.
