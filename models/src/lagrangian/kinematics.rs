@@ -140,13 +140,16 @@ impl<S: Scalar> Poses<S> {
         Pose { x, y, z, at: self.position[joint] }
     }
 
-    /// Puts the pose of a joint, at its last axis, into its slots.
+    /// Puts the pose of a joint, at its last axis, into its slots; `OTHER`: it may be a ball joint.
     #[inline(always)]
-    fn put_beside(&mut self, tree: &Tree, joint: usize) {
+    fn put_beside<const OTHER: bool>(&mut self, tree: &Tree, joint: usize) {
         if S::BESIDE == 1 {
             return;
         }
         let pose = self.pose(joint);
+        if !OTHER {
+            return self.sides.put::<S>(joint, pose);
+        }
         self.sides.put::<S>(tree.slots.of(joint), pose);
         if let JointKind::Ball(_) = tree.joints[joint].kind {
             for (axis, z) in [pose.x, pose.y].into_iter().enumerate() {
@@ -234,13 +237,13 @@ impl<S: Scalar> Poses<S> {
             let own = if OTHER { joint.last_axis(i) } else { i };
             W::put_triple(edge, &mut self.edge[own].0);
             let position = W::triple_sum(position, edge);
-            last_position = self.set_aside::<W>(tree, own, last, position);
+            last_position = self.set_aside::<W, OTHER>(tree, own, last, position);
         }
     }
 
     /// Takes note of the pose of a joint; returns its position, from the origin that counts from now on.
     #[inline(always)]
-    fn set_aside<W: Wide<S>>(
+    fn set_aside<W: Wide<S>, const OTHER: bool>(
         &mut self,
         tree: &Tree,
         joint: usize,
@@ -255,7 +258,7 @@ impl<S: Scalar> Poses<S> {
             self.move_origin(tree, joint);
             position = W::triple(&[S::ZERO; 3]);
         }
-        self.put_beside(tree, joint);
+        self.put_beside::<OTHER>(tree, joint);
         position
     }
 
@@ -270,7 +273,7 @@ impl<S: Scalar> Poses<S> {
                 return;
             }
             self.position[parent] = self.position[i] - self.edge[i];
-            self.put_beside(tree, parent);
+            self.put_beside::<true>(tree, parent);
             i = parent;
         }
     }

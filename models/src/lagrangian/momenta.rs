@@ -14,7 +14,7 @@ use plantd_math::spatial::{Force, Motion, Pose, Vec3};
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::sums::{Sums, firsts, firsts_of_links};
 use crate::model::slots::Slots;
-use crate::model::tree::{JointKind, Rotational, Tree};
+use crate::model::tree::{JointKind, Rotational, Tree, WORLD};
 
 /// Twists and momenta of a tree.
 ///
@@ -80,10 +80,17 @@ impl<S: Scalar> Beside<S> for Gradient<'_, S> {
 /// Numbers of the slots that begin with `i`, from a list of those of coordinates; zero beyond the list.
 #[inline(always)]
 fn collect<S: Scalar, W: Wide<S>>(slots: &Slots, i: usize, list: &[S]) -> W {
-    match list.get(i..i + S::BESIDE) {
-        Some(numbers) if slots.are_in_order => W::load(&S::several(|lane| numbers[lane])),
-        _ => collect_of(&slots.coordinates[0][i..i + S::BESIDE], list),
+    if !slots.are_in_order {
+        return collect_of(&slots.coordinates[0][i..i + S::BESIDE], list);
     }
+    if let Some(numbers) = list.get(i..i + S::BESIDE) {
+        return W::load(&S::several(|lane| numbers[lane]));
+    }
+    let mut several = S::Several::default();
+    for (lane, number) in list.iter().skip(i).take(S::BESIDE).enumerate() {
+        number.put(&mut several, lane);
+    }
+    W::load(&several)
 }
 
 /// Numbers of coordinates from a list; zero beyond it.
@@ -103,18 +110,15 @@ fn collect_of<S: Scalar, W: Wide<S>>(coordinates: &[usize], list: &[S]) -> W {
 fn scatter<S: Scalar, W: Wide<S>>(slots: &Slots, i: usize, wide: W, list: &mut [S]) {
     let mut several = S::Several::default();
     wide.store(&mut several);
-    match list.get_mut(i..i + S::BESIDE) {
-        Some(numbers) if slots.are_in_order => {
-            for (lane, number) in numbers.iter_mut().enumerate() {
-                *number = S::one(&several, lane);
-            }
+    if slots.are_in_order {
+        for (lane, number) in list.iter_mut().skip(i).take(S::BESIDE).enumerate() {
+            *number = S::one(&several, lane);
         }
-        _ => {
-            for (lane, coordinate) in slots.coordinates[0][i..i + S::BESIDE].iter().enumerate() {
-                if let Some(number) = list.get_mut(*coordinate) {
-                    *number = S::one(&several, lane);
-                }
-            }
+        return;
+    }
+    for (lane, coordinate) in slots.coordinates[0][i..i + S::BESIDE].iter().enumerate() {
+        if let Some(number) = list.get_mut(*coordinate) {
+            *number = S::one(&several, lane);
         }
     }
 }
@@ -122,6 +126,47 @@ fn scatter<S: Scalar, W: Wide<S>>(slots: &Slots, i: usize, wide: W, list: &mut [
 #[inline(always)]
 fn motion<W: Copy>([p, q, r, x, y, z, ..]: [W; 8]) -> Motion<W> {
     Motion { w: Vec3([p, q, r]), v: Vec3([x, y, z]) }
+}
+
+/// Axes in the slots that begin with `i`.
+#[inline(always)]
+fn axis_at<S: Scalar, W: Wide<S>>(
+    tree: &Tree,
+    Pose { z, at, .. }: &Pose<W>,
+    i: usize,
+) -> Motion<W> {
+    let (z, at) = (*z, *at);
+    match tree.joints[tree.slots.joints[i]].kind {
+        // Alone, a joint is of one kind.
+        JointKind::Prismatic if S::BESIDE == 1 => Motion { w: Vec3::ZERO, v: z },
+        JointKind::Revolute | JointKind::Ball(_) if S::BESIDE == 1 => {
+            Motion { w: z, v: at.cross(z) }
+        }
+        _ => {
+            let fixed = tree.fixed::<S, W>(i);
+            let v = at.cross(z) * fixed.turns + z * fixed.slides;
+            Motion { w: z * fixed.turns, v }
+        }
+    }
+}
+
+/// How the links that begin with `i` move beside what carries them.
+#[inline(always)]
+fn own_twist<S: Scalar, W: Wide<S>, const BALLS: bool>(
+    slots: &Slots,
+    i: usize,
+    (pose, axis): (&Pose<W>, Motion<W>),
+    velocity: &[S],
+) -> Motion<W> {
+    let own = axis.scaled(collect(slots, i, velocity));
+    if !BALLS || (S::BESIDE == 1 && !slots.is_ball(i)) {
+        return own;
+    }
+    let ([_, first, second], lanes) = (&slots.coordinates, i..i + S::BESIDE);
+    let first: W = collect_of(&first[lanes.clone()], velocity);
+    let second: W = collect_of(&second[lanes], velocity);
+    let turn = pose.x * first + pose.y * second;
+    Motion { w: own.w + turn, v: own.v + pose.at.cross(turn) }
 }
 
 impl<S: Scalar> Momenta<S> {
@@ -193,17 +238,33 @@ impl<S: Scalar> Momenta<S> {
         poses: &Poses<S>,
         velocity: &[S],
     ) {
+        if S::BESIDE == 1 {
+            return self.one_by_one::<W, BALLS>(tree, poses, velocity);
+        }
         let slots = &tree.slots;
         for i in firsts::<S>(tree) {
-            self.place::<W, BALLS>(tree, poses, velocity, i);
+            let pose = poses.wide::<W, BALLS>(tree, i);
+            let axis = axis_at::<S, W>(tree, &pose, i);
+            self.axis.store::<S, W>(i, axis);
+            if i < slots.parents.len() {
+                let own = own_twist::<S, W, BALLS>(slots, i, (&pose, axis), velocity);
+                let Motion { w: Vec3([p, q, r]), v: Vec3([x, y, z]) } = own;
+                self.sums.put(i, [p, q, r, x, y, z, W::ZERO, W::ZERO]);
+            }
         }
         self.sums.descend::<W, false>(&slots.parents);
-        for i in firsts::<S>(tree) {
+        for i in firsts::<S>(tree).filter(|_| BALLS) {
             let carrier = motion(self.sums.take_from::<W, BALLS>(i, &slots.carriers));
             self.axis_rate.store::<S, W>(i, carrier.cross(self.axis.wide::<S, W>(i)));
         }
         for i in firsts_of_links::<S>(tree) {
-            self.carry::<W, BALLS>(tree, poses, i);
+            let twist = motion(self.sums.take(i));
+            if !BALLS {
+                // What an axis adds to the twist does not move it.
+                self.axis_rate.store::<S, W>(i, twist.cross(self.axis.wide::<S, W>(i)));
+            }
+            let own = self.carry(tree, &poses.wide::<W, BALLS>(tree, i), twist, i);
+            self.sums.put_vectors(i, own);
         }
         self.sums.ascend::<W, true>(&slots.parents);
         for i in firsts::<S>(tree) {
@@ -213,57 +274,76 @@ impl<S: Scalar> Momenta<S> {
         }
     }
 
-    /// Axes in the slots that begin with `i`, and how fast links move along theirs.
+    /// The same where nothing is beside a link: then what it passes on stays in registers.
     #[inline(always)]
-    fn place<W: Wide<S>, const BALLS: bool>(
+    fn one_by_one<W: Wide<S>, const BALLS: bool>(
         &mut self,
         tree: &Tree,
         poses: &Poses<S>,
         velocity: &[S],
-        i: usize,
     ) {
-        let (pose, fixed) = (poses.wide::<W, BALLS>(tree, i), tree.fixed::<S, W>(i));
-        let Pose { x, y, z, at } = pose;
-        let axis = match tree.joints[tree.slots.joints[i]].kind {
-            // Alone, a joint is of one kind.
-            JointKind::Prismatic if S::BESIDE == 1 => Motion { w: Vec3::ZERO, v: z },
-            JointKind::Revolute | JointKind::Ball(_) if S::BESIDE == 1 => {
-                Motion { w: z, v: at.cross(z) }
+        let slots = &tree.slots;
+        let mut twist = Motion { w: Vec3::<W>::ZERO, v: Vec3::ZERO };
+        for (link, &parent) in slots.parents.iter().enumerate() {
+            let pose = poses.wide::<W, BALLS>(tree, link);
+            let axis = axis_at::<S, W>(tree, &pose, link);
+            let own = own_twist::<S, W, BALLS>(slots, link, (&pose, axis), velocity);
+            let above = match parent {
+                WORLD => Motion { w: Vec3::ZERO, v: Vec3::ZERO },
+                parent if parent + 1 == link => twist,
+                parent => self.twist.wide::<S, W>(parent),
+            };
+            twist = Motion { w: above.w + own.w, v: above.v + own.v };
+            self.axis.store::<S, W>(link, axis);
+            if BALLS && slots.is_ball(link) {
+                self.axis_rate.store::<S, W>(link, above.cross(axis));
+                for other in slots.others(link) {
+                    let pose = poses.wide::<W, BALLS>(tree, other);
+                    let axis = axis_at::<S, W>(tree, &pose, other);
+                    self.axis.store::<S, W>(other, axis);
+                    self.axis_rate.store::<S, W>(other, above.cross(axis));
+                }
+            } else {
+                self.axis_rate.store::<S, W>(link, twist.cross(axis));
             }
-            _ => {
-                let v = at.cross(z) * fixed.turns + z * fixed.slides;
-                Motion { w: z * fixed.turns, v }
+            let [n, f, moment] = self.carry(tree, &pose, twist, link);
+            self.momentum.store::<S, W>(link, Force { n, f });
+            self.moment.store::<S, W>(link, moment);
+        }
+        for (link, &parent) in slots.parents.iter().enumerate().rev() {
+            let momentum = self.momentum.wide::<S, W>(link);
+            let moment = self.moment.wide::<S, W>(link);
+            if parent != WORLD {
+                let all = self.momentum.wide::<S, W>(parent).plus(momentum);
+                self.momentum.store::<S, W>(parent, all);
+                let all = self.moment.wide::<S, W>(parent) + moment;
+                self.moment.store::<S, W>(parent, all);
             }
-        };
-        self.axis.store::<S, W>(i, axis);
-        if i >= tree.slots.parents.len() {
-            return;
+            if BALLS && slots.is_ball(link) {
+                for other in slots.others(link) {
+                    self.momentum.store::<S, W>(other, momentum);
+                    self.moment.store::<S, W>(other, moment);
+                }
+            }
         }
-        let mut own = axis.scaled(collect(&tree.slots, i, velocity));
-        if BALLS && (S::BESIDE > 1 || tree.slots.is_ball(i)) {
-            let [_, first, second] = &tree.slots.coordinates;
-            let lanes = i..i + S::BESIDE;
-            let speeds: [W; 2] =
-                [collect_of(&first[lanes.clone()], velocity), collect_of(&second[lanes], velocity)];
-            let turn = x * speeds[0] + y * speeds[1];
-            own = Motion { w: own.w + turn, v: own.v + at.cross(turn) };
-        }
-        let Motion { w: Vec3([p, q, r]), v: Vec3([x, y, z]) } = own;
-        self.sums.put(i, [p, q, r, x, y, z, W::ZERO, W::ZERO]);
     }
 
-    /// Momenta of the bodies of the links that begin with `i`.
+    /// Angular and linear momenta and first moments of mass of the bodies of the links that begin with `i`, by their
+    /// twists; takes note of these, and of the centres of mass.
     #[inline(always)]
-    fn carry<W: Wide<S>, const BALLS: bool>(&mut self, tree: &Tree, poses: &Poses<S>, i: usize) {
-        let twist = motion(self.sums.take(i));
+    fn carry<W: Wide<S>>(
+        &mut self,
+        tree: &Tree,
+        pose: &Pose<W>,
+        twist: Motion<W>,
+        i: usize,
+    ) -> [Vec3<W>; 3] {
         self.twist.store::<S, W>(i, twist);
         let rotational = tree.rotational::<S>(i);
         if let Rotational::None = rotational {
-            self.sums.put_vectors(i, [Vec3::<W>::ZERO; 3]);
-            return;
+            return [Vec3::ZERO; 3];
         }
-        let (pose, fixed) = (poses.wide::<W, BALLS>(tree, i), tree.fixed::<S, W>(i));
-        let rotation = pose.rotation();
+        let (rotation, fixed) = (pose.rotation(), tree.fixed::<S, W>(i));
         let center = pose.at + rotation.apply(fixed.center);
         let linear = twist.at(center) * fixed.mass;
         let mut angular = center.cross(linear);
@@ -276,7 +356,7 @@ impl<S: Scalar> Momenta<S> {
             }
         }
         self.center.store::<S, W>(i, center);
-        self.sums.put_vectors(i, [angular, linear, center * fixed.mass]);
+        [angular, linear, center * fixed.mass]
     }
 
     /// Twice the kinetic energy, `Σ v_i J_i·H_i`, of the last [`Momenta::gradient`].

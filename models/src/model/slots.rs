@@ -102,6 +102,13 @@ impl Slots {
         self.coordinates[1][link] != NONE
     }
 
+    /// The slots of the first two axes of a ball joint.
+    #[inline(always)]
+    pub(crate) fn others(&self, link: usize) -> [usize; 2] {
+        let joint = self.joints[link];
+        [self.of[joint - 2], self.of[joint - 1]]
+    }
+
     /// Where a list of links has zeros, for what the world carries.
     #[inline(always)]
     pub(crate) fn nothing(&self) -> usize {
