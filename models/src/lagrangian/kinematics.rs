@@ -107,16 +107,14 @@ impl<S: Scalar> Poses<S> {
     /// World-axes direction of the axis of a joint.
     #[inline(always)]
     pub(crate) fn axis(&self, tree: &Tree, joint: usize) -> Vec3<S> {
-        match tree.joints[joint].kind {
-            JointKind::Ball(axis) => self.rotation[joint + 2 - axis].0[axis],
-            _ => self.rotation[joint].0[2],
-        }
+        let [at, axis] = tree.slots.lines[joint];
+        self.rotation[at].0[axis]
     }
 
     /// Where a joint is.
     #[inline(always)]
     pub(crate) fn place(&self, tree: &Tree, joint: usize) -> Vec3<S> {
-        self.position[tree.joints[joint].last_axis(joint)]
+        self.position[tree.slots.lines[joint][0]]
     }
 
     /// Poses of the slots that begin with `i`; of the first two axes of a ball joint, the `z` axis and the position
@@ -129,9 +127,9 @@ impl<S: Scalar> Poses<S> {
         if !BALLS {
             return self.pose(i).map(W::of_one);
         }
-        let [joint, axis] = tree.slots.poses[i];
-        let z = self.rotation[joint].0[axis];
-        Pose { z, ..self.pose(joint) }.map(W::of_one)
+        let [at, axis] = tree.slots.lines[tree.slots.joints[i]];
+        let z = self.rotation[at].0[axis];
+        Pose { z, ..self.pose(at) }.map(W::of_one)
     }
 
     #[inline(always)]

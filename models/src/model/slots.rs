@@ -19,8 +19,8 @@ pub(crate) struct Slots {
     pub(crate) parents: Vec<usize>,
     /// The joint of each slot; beyond the last, the slot itself.
     pub(crate) joints: Vec<usize>,
-    /// At which joint the pose of each slot is, and which axis of it is that of the slot.
-    pub(crate) poses: Vec<[usize; 2]>,
+    /// At which joint the pose of each joint is, and which of its axes that of the joint is.
+    pub(crate) lines: Vec<[usize; 2]>,
     /// The link of each slot.
     pub(crate) links: Vec<usize>,
     /// The link that carries the axis of each slot, or [`Slots::nothing`]: an axis turns with what a ball joint hangs
@@ -64,12 +64,12 @@ impl Slots {
             _ => NONE,
         };
         let by_slot = |f: &dyn Fn(usize) -> usize| order.iter().map(|joint| f(*joint)).collect();
-        let pose = |joint: usize| match joints[joint].kind {
-            JointKind::Ball(axis) => [joint + 2 - axis, axis],
-            _ => [joint, 2],
+        let line = |(i, joint): (usize, &Joint)| match joint.kind {
+            JointKind::Ball(axis) => [joint.last_axis(i), axis],
+            _ => [i, 2],
         };
         Self {
-            poses: order.iter().map(|joint| pose(*joint)).collect(),
+            lines: joints.iter().enumerate().map(line).collect(),
             parents: order[..links].iter().map(|joint| above(*joint)).collect(),
             links: padded(by_slot(&link), &|_| 0),
             carriers: padded(by_slot(&carrier), &|_| nothing),
@@ -113,5 +113,38 @@ impl Slots {
     #[inline(always)]
     pub(crate) fn nothing(&self) -> usize {
         self.parents.len().next_multiple_of(LANES)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::mechanism::Model;
+    use plantd_scene::builtin;
+
+    /// Every joint has a slot of its own, those that carry something come first, and each link hangs from the link of
+    /// the joint that its first axis hangs from.
+    #[test]
+    fn joints_have_one_slot_each_and_links_come_first() {
+        for name in ["tree-7", "walker-3", "balls-7"] {
+            let model = Model::compile(&builtin::scene(name).unwrap()).unwrap();
+            let (joints, slots) = (&model.dynamics.joints, &model.dynamics.slots);
+            let mut seen = vec![false; joints.len()];
+            for (i, joint) in joints.iter().enumerate() {
+                let slot = slots.of(i);
+                assert!(!std::mem::replace(&mut seen[slot], true), "{name}: slot {slot}");
+                assert_eq!(slots.joints[slot], i, "{name}");
+                assert_eq!(slots.coordinates[0][slot], joint.coordinate, "{name}");
+                let link = slots.link(i);
+                assert!(link < slots.parents.len(), "{name}");
+                assert_eq!(slots.joints[link], joint.last_axis(i), "{name}");
+                let above = joints[joint.first_axis(i)].parent;
+                let expected = if above == WORLD { WORLD } else { slots.link(above) };
+                assert_eq!(slots.parents[link], expected, "{name}");
+            }
+            let balls = joints.iter().filter(|joint| joint.kind == JointKind::Ball(0)).count();
+            assert_eq!(slots.parents.len() + 2 * balls, joints.len(), "{name}");
+            assert_eq!(slots.are_in_order, balls == 0, "{name}");
+        }
     }
 }
