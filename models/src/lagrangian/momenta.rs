@@ -252,7 +252,7 @@ impl<S: Scalar> Momenta<S> {
                 self.sums.put(i, [p, q, r, x, y, z, W::ZERO, W::ZERO]);
             }
         }
-        self.sums.descend::<W, false>(&slots.parents);
+        self.sums.descend::<W>(&slots.parents);
         for i in firsts::<S>(tree).filter(|_| BALLS) {
             let carrier = motion(self.sums.take_from::<W, BALLS>(i, &slots.carriers));
             self.axis_rate.store::<S, W>(i, carrier.cross(self.axis.wide::<S, W>(i)));

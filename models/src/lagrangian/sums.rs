@@ -14,7 +14,7 @@ use crate::model::tree::{Tree, WORLD};
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Sums<S: Scalar> {
     rows: Vec<S::Row>,
-    ninths: Vec<S::Several>,
+    ninths: Vec<S>,
 }
 
 /// Where slots begin that are side by side.
@@ -33,7 +33,7 @@ impl<S: Scalar> Sums<S> {
     pub(crate) fn new(slots: &Slots) -> Self {
         Self {
             rows: vec![S::Row::default(); slots.nothing() + 1],
-            ninths: vec![S::Several::default(); slots.parents.len().div_ceil(S::BESIDE)],
+            ninths: vec![S::ZERO; slots.nothing()],
         }
     }
 
@@ -47,7 +47,11 @@ impl<S: Scalar> Sums<S> {
     #[inline(always)]
     pub(crate) fn put_vectors<W: Wide<S>>(&mut self, i: usize, [a, b, c]: [Vec3<W>; 3]) {
         self.put(i, [a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1]]);
-        c[2].store(&mut self.ninths[i / S::BESIDE]);
+        let mut several = S::Several::default();
+        c[2].store(&mut several);
+        for (lane, ninth) in self.ninths[i..i + S::BESIDE].iter_mut().enumerate() {
+            *ninth = S::one(&several, lane);
+        }
     }
 
     /// The first eight sums of the links that begin with `i`.
@@ -77,37 +81,31 @@ impl<S: Scalar> Sums<S> {
         links: &[usize],
     ) -> [Vec3<W>; 3] {
         let [p, q, r, s, t, u, x, y] = self.take_from::<W, BALLS>(i, links);
-        let z = match BALLS {
-            true => W::load(&S::several(|lane| ninth::<S>(&self.ninths, links[i + lane]))),
-            false => W::load(&self.ninths[i / S::BESIDE]),
+        let z = if BALLS {
+            let links = &links[i..i + S::BESIDE];
+            W::load(&S::several(|lane| self.ninths[links[lane]]))
+        } else {
+            let ninths = &self.ninths[i..i + S::BESIDE];
+            W::load(&S::several(|lane| ninths[lane]))
         };
         [Vec3([p, q, r]), Vec3([s, t, u]), Vec3([x, y, z])]
     }
 
-    /// Each link gets what its parent has; `NINTH`: also of the ninth numbers.
+    /// Each link gets what its parent has, but for ninth numbers.
     #[inline(always)]
-    pub(crate) fn descend<W: Wide<S>, const NINTH: bool>(&mut self, parents: &[usize]) {
+    pub(crate) fn descend<W: Wide<S>>(&mut self, parents: &[usize]) {
         let rows = &mut self.rows[..];
         let Some(first) = rows.first() else { return };
-        let (mut last, mut last_ninth) = (W::row(first), S::ZERO);
+        let mut last = W::row(first);
         for (i, &parent) in parents.iter().enumerate() {
             let mut sum = W::row(&rows[i]);
-            let is_next = parent.wrapping_add(1) == i;
             if parent != WORLD {
+                let is_next = parent.wrapping_add(1) == i;
                 let above = if is_next { last } else { W::row(&rows[parent]) };
                 sum = W::sum(above, sum);
                 W::put_row(sum, &mut rows[i]);
             }
             last = sum;
-            if NINTH {
-                let mut sum = ninth::<S>(&self.ninths, i);
-                if parent != WORLD {
-                    let above = if is_next { last_ninth } else { ninth::<S>(&self.ninths, parent) };
-                    sum = above + sum;
-                    sum.put(&mut self.ninths[i / S::BESIDE], i % S::BESIDE);
-                }
-                last_ninth = sum;
-            }
         }
     }
 
@@ -125,27 +123,20 @@ impl<S: Scalar> Sums<S> {
             }
             below = sum;
             if NINTH {
-                let mut sum = ninth::<S>(&self.ninths, i);
+                let sum = &mut self.ninths[i];
                 if is_followed {
-                    sum += below_ninth;
-                    sum.put(&mut self.ninths[i / S::BESIDE], i % S::BESIDE);
+                    *sum += below_ninth;
                 }
-                below_ninth = sum;
+                below_ninth = *sum;
             }
             is_followed = parent.wrapping_add(1) == i && i > 0;
             if parent != WORLD && !is_followed {
                 let all = W::sum(W::row(&rows[parent]), below);
                 W::put_row(all, &mut rows[parent]);
                 if NINTH {
-                    let all = ninth::<S>(&self.ninths, parent) + below_ninth;
-                    all.put(&mut self.ninths[parent / S::BESIDE], parent % S::BESIDE);
+                    self.ninths[parent] += below_ninth;
                 }
             }
         }
     }
-}
-
-#[inline(always)]
-fn ninth<S: Scalar>(ninths: &[S::Several], i: usize) -> S {
-    S::one(&ninths[i / S::BESIDE], i % S::BESIDE)
 }
