@@ -55,7 +55,7 @@ pub(crate) struct Balls {
     width: usize,
     /// `σ_ij`, column after column, padded.
     skew: Vec<Lanes>,
-    /// Orientations at the start and half-way, and how they turn: side by side, by the `places` in `sums`.
+    /// Orientations at the start and half-way, and how they turn; side by side, of the `places` in `turn`.
     start: Vec<Mat3>,
     start_beside: Sided<Mat3<Block>>,
     centers: Vec<Mat3>,
