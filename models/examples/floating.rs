@@ -106,7 +106,7 @@ fn print_errors(name: &str, scene: &Scene, precision: Precision) -> Result<(), B
     };
     let (reference, _) = run(8, 1000, Precision::Exact).ok_or("no reference")?;
     let mut fastest = [(f64::INFINITY, 0, 0); 4];
-    for order in [2, 4, 6, 8, 12] {
+    for order in [2, 4, 6, 8, 12, 16] {
         for steps in [4, 6, 8, 11, 16, 23, 32, 45, 64, 91, 128, 181, 256, 362, 512] {
             let Some((q, mut time)) = run(order, steps, precision) else { continue };
             for _ in 0..3 {

@@ -5,7 +5,7 @@
 //! the last configuration, or with `error:` and a reason. Methods: `midpoint`, `midpoint-ab` (a step
 //! with A and B of all torques, column by column in memory of the driver's), the same with `-rough` (with new
 //! torques at each step) or with `-moving` (without the first step of a pass, which
-//! finds the velocity that a momentum means), `order-4` to `order-12` (Gauss collocation), `order-4-fast`
+//! finds the velocity that a momentum means), `order-4` to `order-16` (Gauss collocation), `order-4-fast`
 //! and so on, `order-4-coarse` (solved to what the precisions `fast` and `coarse` ask for), and `scalar`: the midpoint rule written by hand
 //! for a pendulum.
 

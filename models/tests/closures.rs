@@ -6,7 +6,7 @@ use crate::second_order::check_with as check_second_order_with;
 use nalgebra::DMatrix;
 use plantd_models::{Initial, Linearization, Plant, Scene, Settings, Snapshot};
 
-const ORDERS: [u32; 4] = [4, 6, 8, 12];
+const ORDERS: [u32; 5] = [4, 6, 8, 12, 16];
 
 /// Two arms in space on three oblique hinges each, whose hands are one point.
 fn spatial(more: &str) -> Scene {

@@ -5,7 +5,7 @@ use crate::common::{plant, wave};
 use nalgebra::{DMatrix, Vector3};
 use plantd_models::{Initial, Linearization, Model, Plant, Scene, Settings, Snapshot};
 
-const ORDERS: [u32; 4] = [4, 6, 8, 12];
+const ORDERS: [u32; 5] = [4, 6, 8, 12, 16];
 
 /// A floating body with an arm on a ball joint that carries a hinge, and a leg on a hinge that carries a ball
 /// joint.

@@ -110,7 +110,7 @@ fn multipliers_have_least_norm() {
 #[test]
 fn collocation_has_redundant_equations() {
     for (redundant, count) in [(doubled(), 2), (out_of_plane(false), 1), (out_of_plane(true), 1)] {
-        for order in [4, 8, 12] {
+        for order in [4, 8, 12, 16] {
             let mut one = plant(&plain(&redundant), |s| s.order = order);
             let mut two = plant(&redundant, |s| s.order = order);
             for k in 0..60 {

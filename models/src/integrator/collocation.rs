@@ -29,14 +29,19 @@ pub(crate) mod secants;
 pub(crate) mod slopes;
 pub(crate) mod system;
 
+use plantd_math::scalar::Lanes;
+use plantd_math::simd::{AVX512, has};
+
 use crate::integrator::collocation::system::System;
 use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::scheme::Tableau;
 use crate::integrator::workspace::{StepContext, Workspace};
+use crate::linearization::linearize::Linearization;
 use crate::model::mechanism::Model;
 
-/// Unknowns up to which the dense Jacobian is taken.
-const DENSE: usize = 48;
+/// Unknowns up to which the dense Jacobian is taken. With 28 (an arm at order 8) rounds with the mass matrices take as
+/// long to large errors and 0.6 of it to small ones; with 48 (a chain of 8 at order 12) 0.4 of it.
+const DENSE: usize = 24;
 /// The same with constraints, whose multipliers count: where the two cost the same (scissor lifts, the marionette).
 const DENSE_BOUND: usize = 54;
 
@@ -49,8 +54,25 @@ pub(crate) struct Collocation {
     /// Velocities at the stages of the solution, one after the other, then forces `L_q + f`; of ball joints angular
     /// velocities.
     pub(crate) motion: Vec<f64>,
-    /// The stages.
-    pub(crate) system: Box<System>,
+    stages: Stages,
+}
+
+/// The stages, in registers that suit them. A few more than four lie in one of eight, which takes about as long as
+/// one of four.
+#[derive(Clone, Debug)]
+enum Stages {
+    Fours(Box<System<4>>),
+    Eights(Box<System<8>>),
+}
+
+/// The same with the stages, however many lie side by side.
+macro_rules! with_stages {
+    ($stages:expr, $system:ident => $result:expr) => {
+        match $stages {
+            Stages::Fours($system) => $result,
+            Stages::Eights($system) => $result,
+        }
+    };
 }
 
 impl Collocation {
@@ -60,14 +82,18 @@ impl Collocation {
         let most = if d.constraints > 0 { DENSE_BOUND } else { DENSE };
         let unknowns = stages * (d.dynamic + d.constraints);
         let by_masses = unknowns > most || !model.orientations.is_empty();
-        let mut system = System::new(model, &tableau, by_masses);
+        let mut stages = if stages > Lanes::COUNT && has(AVX512) {
+            Stages::Eights(Box::new(System::new(model, &tableau, by_masses)))
+        } else {
+            Stages::Fours(Box::new(System::new(model, &tableau, by_masses)))
+        };
         if !by_masses {
-            system.make_dense(model, &tableau);
+            with_stages!(&mut stages, system => system.make_dense(model, &tableau));
         }
         Self {
-            inputs: vec![0.0; stages * d.inputs],
-            motion: vec![0.0; 2 * stages * d.dynamic],
-            system: Box::new(system),
+            inputs: vec![0.0; tableau.nodes.len() * d.inputs],
+            motion: vec![0.0; 2 * tableau.nodes.len() * d.dynamic],
+            stages,
             tableau,
         }
     }
@@ -81,27 +107,19 @@ impl Collocation {
         start_s: f64,
     ) -> Result<StepReport, StepError> {
         self.guess(workspace, at, start_s)?;
-        let Self { tableau, inputs, motion, system } = self;
-        system.begin(at, motion, inputs, &mut workspace.mid.input_force);
-        let has_both = system.balls.is_some() && system.closures.is_some();
-        let mut report = match system.correct_alike(workspace, at, inputs) {
-            Some(Ok(report)) => report,
-            Some(Err(error)) if has_both => return Err(explain(workspace, at, error)),
-            _ => {
-                system.make_dense(at.model, tableau);
-                system.begin(at, motion, inputs, &mut workspace.mid.input_force);
-                let corrected = system.correct(workspace, at, inputs);
-                corrected.map_err(|error| explain(workspace, at, error))?
-            }
-        };
-        let step = &mut workspace.step;
-        let sums = [&mut *step.increment, &mut *step.impulse, &mut *step.multipliers];
-        system.finish(at.model, motion, report.redundant_constraints, sums)?;
-        workspace.prepare(at);
-        if at.model.dimensions.constraints == 0 {
-            workspace.kkt.estimates.write(&mut report);
-        }
-        Ok(report)
+        let Self { tableau, inputs, motion, stages } = self;
+        with_stages!(stages, system => system.solve(workspace, at, tableau, [inputs, motion]))
+    }
+
+    /// Linearizes at the solution of the last step.
+    pub(crate) fn linearize(
+        &mut self,
+        workspace: &mut Workspace,
+        at: StepContext<'_>,
+        out: &mut Linearization,
+    ) -> Result<(), StepError> {
+        let Self { tableau, inputs, stages, .. } = self;
+        with_stages!(stages, system => system.linearize(workspace, at, tableau, inputs, out))
     }
 
     /// Guesses the motion; takes the inputs of the stages.
@@ -136,6 +154,38 @@ impl Collocation {
             }
         }
         Ok(())
+    }
+}
+
+impl<const N: usize> System<N> {
+    /// Solves a step from the guess in `motion`, which becomes that of the solution.
+    fn solve(
+        &mut self,
+        workspace: &mut Workspace,
+        at: StepContext<'_>,
+        tableau: &Tableau,
+        [inputs, motion]: [&mut [f64]; 2],
+    ) -> Result<StepReport, StepError> {
+        self.begin(at, motion, inputs, &mut workspace.mid.input_force);
+        let has_both = self.balls.is_some() && self.closures.is_some();
+        let mut report = match self.correct_alike(workspace, at, inputs) {
+            Some(Ok(report)) => report,
+            Some(Err(error)) if has_both => return Err(explain(workspace, at, error)),
+            _ => {
+                self.make_dense(at.model, tableau);
+                self.begin(at, motion, inputs, &mut workspace.mid.input_force);
+                let corrected = self.correct(workspace, at, inputs);
+                corrected.map_err(|error| explain(workspace, at, error))?
+            }
+        };
+        let step = &mut workspace.step;
+        let sums = [&mut *step.increment, &mut *step.impulse, &mut *step.multipliers];
+        self.finish(at.model, motion, report.redundant_constraints, sums)?;
+        workspace.prepare(at);
+        if at.model.dimensions.constraints == 0 {
+            workspace.kkt.estimates.write(&mut report);
+        }
+        Ok(report)
     }
 }
 

@@ -19,7 +19,7 @@
 use plantd_math::trigonometry::sin_cos_of;
 
 /// Stages at most.
-pub(crate) const STAGES_MAX: usize = 6;
+pub(crate) const STAGES_MAX: usize = 8;
 
 /// How a substep is taken.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -34,8 +34,8 @@ impl Scheme {
     pub(crate) fn of_order(order: u32) -> Result<Self, &'static str> {
         match order {
             2 => Ok(Self::Midpoint),
-            4 | 6 | 8 | 12 => Ok(Self::Gauss(order as usize / 2)),
-            _ => Err("is none of 2, 4, 6, 8 and 12"),
+            4 | 6 | 8 | 12 | 16 => Ok(Self::Gauss(order as usize / 2)),
+            _ => Err("is none of 2, 4, 6, 8, 12 and 16"),
         }
     }
 }
@@ -164,7 +164,7 @@ mod tests {
     /// The simplifying assumptions B(2s) and C(s), and symplecticity, which define the method.
     #[test]
     fn the_tableaus_are_those_of_gauss() {
-        for stages in [1, 2, 3, 4, 6] {
+        for stages in [1, 2, 3, 4, 6, 8] {
             let Tableau { nodes, weights, coupling, skew, .. } = Tableau::new(stages);
             for k in 1..=2 * stages as i32 {
                 let sum: f64 = weights.iter().zip(&nodes).map(|(b, c)| b * c.powi(k - 1)).sum();
@@ -189,7 +189,7 @@ mod tests {
     /// Lobatto's quadrature, polynomials of degree s, and the ends.
     #[test]
     fn the_nodes_of_constraints_are_those_of_lobatto() {
-        for stages in [1, 2, 3, 4, 6] {
+        for stages in [1, 2, 3, 4, 6, 8] {
             let Tableau { nodes, weights, ends, reach, shares, .. } = Tableau::new(stages);
             let mut lobatto = shares.clone();
             lobatto[0] *= 0.5;

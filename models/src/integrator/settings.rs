@@ -14,7 +14,7 @@ pub(crate) const STEPS_MAX: usize = 8192;
 pub struct Settings {
     /// Control period `h`, s: what a controller sees as one step; finite and greater than zero.
     pub time_step_s: f64,
-    /// Order of accuracy in `h`: 2 is the midpoint rule; 4, 6, 8 and 12 are Gauss collocation.
+    /// Order of accuracy in `h`: 2 is the midpoint rule; 4, 6, 8, 12 and 16 are Gauss collocation.
     pub order: u32,
     /// Steps of the method in a control period, 1 to [`SUBSTEPS_MAX`]. The input is held; prescribed
     /// coordinates move at a constant rate.

@@ -20,7 +20,6 @@ use plantd_math::rotation::Turn;
 use plantd_math::rows::{add_product, add_rows};
 use plantd_math::spatial::{Mat3, three};
 
-use crate::integrator::collocation::Collocation;
 use crate::integrator::collocation::closures::Closures;
 use crate::integrator::collocation::slopes::{Closing, Slopes};
 use crate::integrator::collocation::system::System;
@@ -32,76 +31,74 @@ use crate::integrator::workspace::{StepContext, Workspace};
 use crate::lagrangian::turning::Turning;
 use crate::linearization::linearize::{Linearization, NodeTangents, StageTangents};
 
-impl Collocation {
+impl<const N: usize> System<N> {
     /// Linearizes at the solution of the last step.
     pub(crate) fn linearize(
         &mut self,
         workspace: &mut Workspace,
         at: StepContext<'_>,
+        tableau: &Tableau,
+        inputs: &[f64],
         out: &mut Linearization,
     ) -> Result<(), StepError> {
         let model = at.model;
         let d = model.dimensions;
-        let (count, n, nd) = (self.tableau.nodes.len(), d.coordinates(), d.dynamic);
+        let (count, n, nd) = (tableau.nodes.len(), d.coordinates(), d.dynamic);
         let h = at.settings.time_step_s;
         let theta = Parameters::new(model);
         let stride = theta.stride;
-        let system = &mut *self.system;
-        system.make_dense(model, &self.tableau);
+        self.make_dense(model, tableau);
         let mut tangents = out.take_stages().unwrap_or_else(|| {
             Box::new(StageTangents {
                 time_step_s: h,
-                tableau: self.tableau.clone(),
+                tableau: tableau.clone(),
                 q: vec![0.0; count * n],
                 velocity: vec![0.0; count * n],
                 inputs: vec![0.0; count * d.inputs],
                 tangent: vec![0.0; count * nd * stride],
                 impulses: vec![0.0; count * nd * stride],
                 slopes: vec![0.0; nd * count * nd],
-                matrix: system.matrix.clone(),
+                matrix: self.matrix.clone(),
                 terms: Vec::new(),
                 momentum: vec![0.0; nd],
                 orientations: vec![Mat3::IDENTITY; model.orientations.len()],
-                nodes: system
-                    .closures
-                    .as_deref()
-                    .map(|closures| NodeTangents::new(closures, &theta)),
+                nodes: self.closures.as_deref().map(|closures| NodeTangents::new(closures, &theta)),
             })
         });
-        system.evaluate(workspace, at, &self.inputs);
-        system.differentiate(workspace, at, &self.inputs);
+        self.evaluate(workspace, at, inputs);
+        self.differentiate(workspace, at, inputs);
         for i in 0..count {
-            system.place(workspace, at.state, i);
+            self.place(workspace, at.state, i);
             tangents.q[i * n..][..n].copy_from_slice(&workspace.mid.q);
             tangents.velocity[i * n..][..n].copy_from_slice(&workspace.mid.velocity);
-            system.take_rates(i, &mut tangents.velocity[i * n..][..n]);
+            self.take_rates(i, &mut tangents.velocity[i * n..][..n]);
         }
-        tangents.inputs.copy_from_slice(&self.inputs);
+        tangents.inputs.copy_from_slice(inputs);
         workspace.prepare(at);
-        if let Some(closures) = &mut system.closures {
+        if let Some(closures) = &mut self.closures {
             closures.curve(model, true);
         }
-        system.fill_matrix(at);
-        if !system.matrix.invert() {
+        self.fill_matrix(at);
+        if !self.matrix.invert() {
             return Err(StepError::NotFinite { iterations: 0 });
         }
-        let closing = system.slopes.as_ref().and_then(|slopes| slopes.closing.as_deref());
-        if let Some(closures) = &mut system.closures {
-            closures.factor(at, &mut system.matrix, closing)?;
+        let closing = self.slopes.as_ref().and_then(|slopes| slopes.closing.as_deref());
+        if let Some(closures) = &mut self.closures {
+            closures.factor(at, &mut self.matrix, closing)?;
         }
-        if system.slopes.is_some() {
-            tangents.take(system, at.state);
+        if self.slopes.is_some() {
+            tangents.take(self, at.state);
         } else {
-            tangents.fill(system, &self.tableau, &theta, h);
+            tangents.fill(self, tableau, &theta, h);
         }
         let StageTangents { tangent, impulses, slopes, terms, nodes, .. } = &mut *tangents;
         let mut curvature = vec![0.0; if nodes.is_some() { nd * stride } else { 0 }];
-        if let (Some(closures), None) = (&system.closures, closing) {
+        if let (Some(closures), None) = (&self.closures, closing) {
             closures.add_slopes(&theta, tangent, &mut curvature, slopes);
         }
-        system.matrix.solve_rows(tangent, stride);
+        self.matrix.solve_rows(tangent, stride);
         out.begin_collocation(h);
-        if let (Some(closures), Some(nodes)) = (&mut system.closures, nodes.as_mut()) {
+        if let (Some(closures), Some(nodes)) = (&mut self.closures, nodes.as_mut()) {
             closures.close(model, &theta, tangent, &mut nodes.tangent, closing);
             nodes.take(closures, closing);
             let mut lambda = vec![0.0; stride];
@@ -114,7 +111,7 @@ impl Collocation {
             }
         }
         tangent.iter_mut().for_each(|entry| *entry = -*entry);
-        let turned = system.slopes.as_deref();
+        let turned = self.slopes.as_deref();
         for &c in &model.orientations {
             let turn = three(&workspace.step.increment, c);
             out.ends.turnings.push(Turning::new(model, c, Turn::new(turn), h));
@@ -155,7 +152,7 @@ impl Collocation {
         }
 
         tangents.time_step_s = h;
-        tangents.matrix.take_inverse_of(&system.matrix);
+        tangents.matrix.take_inverse_of(&self.matrix);
         out.keep_stages(tangents);
         Ok(())
     }
@@ -190,7 +187,7 @@ impl NodeTangents {
 
 impl StageTangents {
     /// Takes the derivatives of a step with ball joints, where they have been found.
-    fn take(&mut self, system: &System, state: &PreciseState) {
+    fn take<const N: usize>(&mut self, system: &System<N>, state: &PreciseState) {
         let Some(slopes) = system.slopes.as_deref() else { return };
         let Slopes { residual: [_, by_theta], next_by: [by_unknowns, _], .. } = slopes;
         self.tangent.copy_from_slice(by_theta);
@@ -202,7 +199,13 @@ impl StageTangents {
     }
 
     /// Writes `∂P_j/∂θ`, `Σ ∂P_j/∂Y`, and into `tangent` the derivatives `R_θ` of the residuals.
-    fn fill(&mut self, system: &System, tableau: &Tableau, theta: &Parameters, h: f64) {
+    fn fill<const N: usize>(
+        &mut self,
+        system: &System<N>,
+        tableau: &Tableau,
+        theta: &Parameters,
+        h: f64,
+    ) {
         let &Parameters { nd, ni, stride, .. } = theta;
         let (n, inputs, next, count) =
             (theta.n(), theta.inputs(), theta.next(), tableau.nodes.len());

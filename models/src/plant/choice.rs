@@ -21,7 +21,7 @@ use crate::plant::initial::{Initial, InitialError};
 /// Control periods of the probe.
 const PERIODS: u32 = 50;
 /// All orders.
-const ORDERS: [u32; 5] = [2, 4, 6, 8, 12];
+const ORDERS: [u32; 6] = [2, 4, 6, 8, 12, 16];
 /// Tolerances below are not told from round-off.
 const LEAST: f64 = 1e-13;
 /// Evaluations of coordinates after which the probe is given up.

@@ -28,7 +28,7 @@ class Stepping(TypedDict, total=False):
     dt: float
     #: Put all forces at the start of a step, as the paper does.
     paper: bool
-    #: Order of accuracy: 2, if not given, or 4, 6, 8 and, without constraints and ball joints, 12.
+    #: Order of accuracy: 2, if not given, or 4, 6, 8, 12 and 16.
     order: int
     #: Steps of the method in a time step, 1 to 256; 1 if not given.
     substeps: int

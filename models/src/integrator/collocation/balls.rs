@@ -30,11 +30,12 @@
 //! the motion itself by `O(h^(2s+1))`, since in the chart `η` about any fixed orientation it is that of ordinary
 //! collocation: the order is `2s`.
 
+use std::array;
+
 use plantd_math::rotation::{Chart, Turn};
 use plantd_math::rows::Block;
-use plantd_math::scalar::{Lanes, LanesOf, Scalar, Side};
+use plantd_math::scalar::{LanesOf, Scalar, Side, in_registers};
 use plantd_math::sided::Sided;
-use plantd_math::simd::wide;
 use plantd_math::spatial::{Mat3, Vec3, three};
 
 use crate::integrator::ball_maps::{CarryOn, ToMatrices, ToMidpoint, beside};
@@ -46,15 +47,15 @@ use crate::model::mechanism::Model;
 /// Rounds in which rates of `η` are found from angular velocities.
 const ROUNDS: usize = 3;
 
-/// The ball joints of all stages.
+/// The ball joints of all stages, `N` of them side by side.
 #[derive(Clone, Debug)]
-pub(crate) struct Balls {
+pub(crate) struct Balls<const N: usize> {
     /// First coordinates.
     pub(crate) coordinates: Vec<usize>,
     count: usize,
     width: usize,
     /// `σ_ij`, column after column, padded.
-    skew: Vec<Lanes>,
+    skew: Vec<LanesOf<N>>,
     /// Orientations at the start and half-way, and how they turn; side by side, of the `places` in `turn`.
     start: Vec<Mat3>,
     start_beside: Sided<Mat3<Block>>,
@@ -66,10 +67,10 @@ pub(crate) struct Balls {
     /// `T`, and `Λ`.
     total: Vec<f64>,
     carried: Vec<f64>,
-    /// Of each four stages, joint after joint: orientations, charts, `V`.
-    orientations: Vec<Mat3<Lanes>>,
-    charts: Vec<Chart<Lanes>>,
-    rates: Vec<Vec3<Lanes>>,
+    /// Of each `N` stages, joint after joint: orientations, charts, `V`.
+    orientations: Vec<Mat3<LanesOf<N>>>,
+    charts: Vec<Chart<LanesOf<N>>>,
+    rates: Vec<Vec3<LanesOf<N>>>,
     /// `h b_i exp(η) (τ + f)`, as numbers of coordinates are.
     torque: Vec<f64>,
     /// With constraints.
@@ -89,44 +90,55 @@ struct Nodes {
     torque: Vec<Vec3>,
 }
 
-/// The numbers of the three coordinates of a joint, of four stages.
+/// The numbers of the three coordinates of a joint, of `N` stages.
 #[inline(always)]
-fn load(numbers: &[f64], coordinate: usize, width: usize, first: usize) -> Vec3<Lanes> {
-    let mut all = [Lanes::ZERO; 3];
+fn load<const N: usize>(
+    numbers: &[f64],
+    coordinate: usize,
+    width: usize,
+    first: usize,
+) -> Vec3<LanesOf<N>> {
+    let mut all = [LanesOf::ZERO; 3];
     for (a, own) in all.iter_mut().enumerate() {
-        *own = Lanes::load(&numbers[(coordinate + a) * width + first..]);
+        *own = LanesOf::load(&numbers[(coordinate + a) * width + first..]);
     }
     Vec3(all)
 }
 
 #[inline(always)]
-fn store(numbers: &mut [f64], coordinate: usize, width: usize, first: usize, values: Vec3<Lanes>) {
+fn store<const N: usize>(
+    numbers: &mut [f64],
+    coordinate: usize,
+    width: usize,
+    first: usize,
+    values: Vec3<LanesOf<N>>,
+) {
     for a in 0..3 {
         values[a].store(&mut numbers[(coordinate + a) * width + first..]);
     }
 }
 
 #[inline(always)]
-fn lane(v: Vec3<Lanes>, lane: usize) -> Vec3 {
+fn lane<const N: usize>(v: Vec3<LanesOf<N>>, lane: usize) -> Vec3 {
     Vec3(v.0.map(|c| c.0[lane]))
 }
 
-impl Balls {
+impl<const N: usize> Balls<N> {
     pub(super) fn new(model: &Model, tableau: &Tableau) -> Self {
         let count = tableau.nodes.len();
-        let width = count.next_multiple_of(Lanes::COUNT);
+        let width = count.next_multiple_of(N);
         let coordinates = model.orientations.clone();
         let no = coordinates.len();
-        let stages = no * width / Lanes::COUNT;
+        let stages = no * width / N;
         let entry = |i: usize, j: usize| {
             if i < count { tableau.skew[i * count + j] } else { 0.0 }
         };
-        let columns = (0..count).flat_map(|j| (0..width).step_by(4).map(move |i| (i, j)));
+        let columns = (0..count).flat_map(|j| (0..width).step_by(N).map(move |i| (i, j)));
         Self {
             count,
             width,
             skew: columns
-                .map(|(i, j)| LanesOf([0, 1, 2, 3].map(|lane| entry(i + lane, j))))
+                .map(|(i, j)| LanesOf(array::from_fn(|lane| entry(i + lane, j))))
                 .collect(),
             start: vec![Mat3::IDENTITY; no],
             start_beside: Sided(vec![Mat3([Vec3::default(); 3]); no.div_ceil(f64::BESIDE)]),
@@ -161,28 +173,28 @@ impl Balls {
         for &c in &self.coordinates {
             let mut turned = [Vec3::ZERO; 2];
             for (g, turned) in turned.iter_mut().enumerate().take(groups) {
-                *turned = load(increment, c, width, g * Lanes::COUNT);
+                *turned = load(increment, c, width, g * N);
             }
             for _ in 0..ROUNDS {
                 let offset = [0, 1]
                     .map(|g| if g < groups { self.offset(increment, c, g) } else { Vec3::ZERO });
                 for g in 0..groups {
                     let own = Chart::new(offset[g]).inverse_dexp().apply(turned[g]);
-                    store(increment, c, width, g * Lanes::COUNT, own);
+                    store(increment, c, width, g * N, own);
                 }
             }
         }
     }
 
     fn groups(&self) -> usize {
-        self.width / Lanes::COUNT
+        self.width / N
     }
 
-    /// `Σ_j σ_ij x_j` of four stages.
+    /// `Σ_j σ_ij x_j` of `N` stages.
     #[inline(always)]
-    fn offset(&self, numbers: &[f64], coordinate: usize, g: usize) -> Vec3<Lanes> {
+    fn offset(&self, numbers: &[f64], coordinate: usize, g: usize) -> Vec3<LanesOf<N>> {
         let (width, groups) = (self.width, self.groups());
-        let mut sums = [Lanes::ZERO; 3];
+        let mut sums = [LanesOf::ZERO; 3];
         for (a, sum) in sums.iter_mut().enumerate() {
             let numbers = &numbers[(coordinate + a) * width..][..self.count];
             for (column, x) in self.skew.chunks_exact(groups).zip(numbers) {
@@ -192,9 +204,9 @@ impl Balls {
         Vec3(sums)
     }
 
-    /// Orientations of four stages.
+    /// Orientations of `N` stages.
     #[inline(always)]
-    pub(super) fn orientations(&self, g: usize) -> &[Mat3<Lanes>] {
+    pub(super) fn orientations(&self, g: usize) -> &[Mat3<LanesOf<N>>] {
         let no = self.coordinates.len();
         &self.orientations[g * no..][..no]
     }
@@ -258,20 +270,20 @@ impl Balls {
         beside(places.len(), ToMidpoint { coordinates, increment, start, turns, middle });
     }
 
-    /// Moves to four stages; writes `η` and `ω` in place of coordinates and velocities.
+    /// Moves to `N` stages; writes `η` and `ω` in place of coordinates and velocities.
     pub(super) fn move_to(
         &mut self,
         increment: &[f64],
-        rates: Lanes,
+        rates: LanesOf<N>,
         g: usize,
-        [q, velocity]: [&mut [Lanes]; 2],
+        [q, velocity]: [&mut [LanesOf<N>]; 2],
     ) {
-        wide!({
+        in_registers!(LanesOf<N>, {
             let no = self.coordinates.len();
             for o in 0..no {
                 let (c, at) = (self.coordinates[o], g * no + o);
                 let offset = self.offset(increment, c, g);
-                let rate = load(increment, c, self.width, g * Lanes::COUNT) * rates;
+                let rate = load(increment, c, self.width, g * N) * rates;
                 let chart = Chart::new(offset);
                 self.orientations[at] = Mat3::lift(self.centers[o]).times(&chart.exp());
                 q[c..c + 3].copy_from_slice(&offset.0);
@@ -281,16 +293,16 @@ impl Balls {
         })
     }
 
-    /// Takes forces and momenta of four stages in the chart; returns what they are the sums of, at most.
+    /// Takes forces and momenta of `N` stages in the chart; returns what they are the sums of, at most.
     pub(super) fn take(
         &mut self,
-        lengths: Lanes,
+        lengths: LanesOf<N>,
         g: usize,
-        (force, l_v): (&[Lanes], &[Lanes]),
+        (force, l_v): (&[LanesOf<N>], &[LanesOf<N>]),
         [impulse, momentum]: [&mut [f64]; 2],
     ) {
-        wide!({
-            let (no, width, first) = (self.coordinates.len(), self.width, g * Lanes::COUNT);
+        in_registers!(LanesOf<N>, {
+            let (no, width, first) = (self.coordinates.len(), self.width, g * N);
             for o in 0..no {
                 let (c, at) = (self.coordinates[o], g * no + o);
                 let chart = &self.charts[at];
@@ -328,11 +340,11 @@ impl Balls {
         residual: &mut [f64],
     ) {
         self.carry(state);
-        wide!({
+        in_registers!(LanesOf<N>, {
             for o in 0..self.coordinates.len() {
                 let (c, carried) = (self.coordinates[o], three(&self.carried, 3 * o));
                 for g in 0..self.groups() {
-                    let first = g * Lanes::COUNT;
+                    let first = g * N;
                     let own = self.offset(impulse, c, g) + Vec3::lift(carried)
                         - load(momentum, c, self.width, first);
                     for (a, own) in own.0.into_iter().enumerate() {
@@ -345,8 +357,8 @@ impl Balls {
     }
 
     /// From a right-hand side by `η` to one by turns of the body, or from its turn to the change of `η`.
-    pub(super) fn change_axes(&self, x: &mut [Lanes], g: usize, back: bool) {
-        wide!({
+    pub(super) fn change_axes(&self, x: &mut [LanesOf<N>], g: usize, back: bool) {
+        in_registers!(LanesOf<N>, {
             let no = self.coordinates.len();
             for (&c, chart) in self.coordinates.iter().zip(&self.charts[g * no..][..no]) {
                 let inverse = chart.inverse_dexp();
@@ -370,16 +382,16 @@ impl Balls {
     /// Places a workspace at a stage.
     pub(super) fn place(&self, workspace: &mut Workspace, stage: usize) {
         let no = self.coordinates.len();
-        let at = stage / Lanes::COUNT * no;
+        let at = stage / N * no;
         for (to, from) in workspace.mid.orientations.iter_mut().zip(&self.orientations[at..]) {
-            *to = Mat3(from.0.map(|axis| lane(axis, stage % Lanes::COUNT)));
+            *to = Mat3(from.0.map(|axis| lane(axis, stage % N)));
         }
     }
 
     /// `η` and `V` of a joint at a stage.
-    pub(super) fn at(&self, o: usize, stage: usize, q: &[Lanes]) -> [Vec3; 2] {
-        let at = stage / Lanes::COUNT * self.coordinates.len() + o;
-        let one = stage % Lanes::COUNT;
+    pub(super) fn at(&self, o: usize, stage: usize, q: &[LanesOf<N>]) -> [Vec3; 2] {
+        let at = stage / N * self.coordinates.len() + o;
+        let one = stage % N;
         [lane(three(q, self.coordinates[o]), one), lane(self.rates[at], one)]
     }
 }

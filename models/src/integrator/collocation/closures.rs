@@ -149,12 +149,12 @@ impl Closures {
 
     /// Evaluates the constraints where the increments `Y` lead, numbers of a coordinate `width` apart; returns what
     /// impulses are the sums of, at most.
-    pub(super) fn evaluate(
+    pub(super) fn evaluate<const N: usize>(
         &mut self,
         StepContext { model, state, .. }: StepContext<'_>,
         increments: &[f64],
         width: usize,
-        mut balls: Option<&mut Balls>,
+        mut balls: Option<&mut Balls<N>>,
     ) -> f64 {
         let d = model.dimensions;
         let (nd, n, count) = (d.dynamic, d.coordinates(), self.count);

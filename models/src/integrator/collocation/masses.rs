@@ -4,42 +4,41 @@
 //! than on anything else: with `Dᵀ M D / h b_i` in place of the Jacobian each round of corrections leaves about `h`
 //! times the rates of the motion of what was left before, and costs O(n·depth) for all stages at once.
 
-use plantd_math::scalar::{Lanes, Scalar, Side};
-use plantd_math::simd::wide;
+use plantd_math::scalar::{LanesOf, Scalar, Side, in_registers};
 
 use crate::integrator::collocation::secants::Secants;
 use crate::lagrangian::arrangement::Planar;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::model::mechanism::Model;
 
-/// `M = Lᵀ Δ L` of the stages: entries in the slots of the elimination, four stages side by side.
+/// `M = Lᵀ Δ L` of the stages: entries in the slots of the elimination, `N` stages side by side.
 #[derive(Clone, Debug)]
-pub(crate) struct Masses {
+pub(crate) struct Masses<const N: usize> {
     groups: usize,
     /// `M`, then `L`: slot after slot, those of all stages.
-    entries: Vec<Lanes>,
+    entries: Vec<LanesOf<N>>,
     /// `Δ⁻¹`.
-    inverse: Vec<Lanes>,
-    /// Right-hand sides of four stages.
-    pub(crate) right: Vec<Lanes>,
+    inverse: Vec<LanesOf<N>>,
+    /// Right-hand sides of `N` stages.
+    pub(crate) right: Vec<LanesOf<N>>,
     pub(crate) secants: Secants,
 }
 
-impl Masses {
+impl<const N: usize> Masses<N> {
     pub(crate) fn new(model: &Model, width: usize, count: usize) -> Self {
-        let (groups, nd) = (width / Lanes::COUNT, model.dimensions.dynamic);
+        let (groups, nd) = (width / N, model.dimensions.dynamic);
         Self {
             groups,
-            entries: vec![Lanes::ZERO; groups * model.elimination.entries()],
-            inverse: vec![Lanes::ZERO; groups * nd],
-            right: vec![Lanes::ZERO; nd],
+            entries: vec![LanesOf::ZERO; groups * model.elimination.entries()],
+            inverse: vec![LanesOf::ZERO; groups * nd],
+            right: vec![LanesOf::ZERO; nd],
             secants: Secants::new(nd * count),
         }
     }
 
     /// Forgets all entries: what is not written is zero.
     pub(crate) fn clear(&mut self) {
-        self.entries.fill(Lanes::ZERO);
+        self.entries.fill(LanesOf::ZERO);
     }
 
     /// Takes the mass matrices at the last gradient, of the stages from one on.
@@ -50,7 +49,7 @@ impl Masses {
         stage: usize,
     ) {
         mechanics.differentiate(model);
-        let (group, lane) = (stage / Lanes::COUNT, stage % Lanes::COUNT);
+        let (group, lane) = (stage / N, stage % N);
         for pair in &model.pairs {
             let second = mechanics.pair(model, pair.ancestor as usize, pair.descendant as usize);
             let entry = &mut self.entries[pair.slot as usize * self.groups + group];
@@ -75,7 +74,7 @@ impl Masses {
     }
 
     fn factor_groups<const GROUPS: usize>(&mut self, model: &Model) {
-        wide!({
+        in_registers!(LanesOf<N>, {
             let elimination = &model.elimination;
             let entries = self.entries.as_chunks_mut::<GROUPS>().0;
             let inverse = self.inverse.as_chunks_mut::<GROUPS>().0;
@@ -102,9 +101,9 @@ impl Masses {
         })
     }
 
-    /// Solves for four stages, in place of the right-hand sides.
+    /// Solves for `N` stages, in place of the right-hand sides.
     pub(crate) fn solve(&mut self, model: &Model, g: usize) {
-        wide!({
+        in_registers!(LanesOf<N>, {
             let (elimination, groups) = (&model.elimination, self.groups);
             let Self { entries, inverse, right, .. } = self;
             for k in (0..elimination.rows()).rev() {

@@ -82,12 +82,12 @@ impl Middle {
 
     /// Factors at the middle of the increments `Y`, numbers of a coordinate `width` apart; false if that is singular.
     /// Ball joints are where they are half-way, and changes of theirs by the axes that they have there.
-    pub(super) fn factor(
+    pub(super) fn factor<const N: usize>(
         &mut self,
         workspace: &mut Workspace,
         at: StepContext<'_>,
         (increments, width): (&[f64], usize),
-        balls: Option<&Balls>,
+        balls: Option<&Balls<N>>,
     ) -> bool {
         let StepContext { model, settings, state, .. } = at;
         self.weigh(model, settings.time_step_s.abs());

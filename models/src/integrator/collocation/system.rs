@@ -1,12 +1,13 @@
-//! All stages, evaluated four side by side, and corrected together.
+//! All stages, evaluated four or eight side by side, and corrected together.
 //!
-//! What belongs to the stages of a coordinate lies side by side, padded to whole [`Lanes`]: number `i` of
+//! What belongs to the stages of a coordinate lies side by side, padded to whole [`LanesOf`]: number `i` of
 //! coordinate `a` is entry `a·width + i`.
+
+use std::array;
 
 use plantd_math::dense_inverse::DenseInverse;
 use plantd_math::norms::{larger, largest};
-use plantd_math::scalar::{Compared, Lanes, LanesOf, Scalar, Side};
-use plantd_math::simd::wide;
+use plantd_math::scalar::{Compared, LanesOf, Scalar, Side, in_registers};
 use plantd_math::spatial::three;
 use plantd_math::trigonometry::without_turns;
 
@@ -41,13 +42,13 @@ const PATIENCE: i32 = 3;
 
 /// What corrects many stages, round after round, without their Jacobian.
 #[derive(Clone, Debug)]
-enum Alike {
-    Masses(Box<Masses>),
+enum Alike<const N: usize> {
+    Masses(Box<Masses<N>>),
     /// With constraints.
     Middle(Box<Middle>),
 }
 
-impl Alike {
+impl<const N: usize> Alike<N> {
     fn new(model: &Model, tableau: &Tableau, width: usize) -> Self {
         if model.dimensions.constraints > 0 {
             return Self::Middle(Box::new(Middle::new(model, tableau)));
@@ -56,18 +57,18 @@ impl Alike {
     }
 }
 
-/// The stages, and all memory that they need.
+/// The stages, `N` of them side by side, and all memory that they need.
 #[derive(Clone, Debug)]
-pub(crate) struct System {
+pub(crate) struct System<const N: usize> {
     count: usize,
     /// The stages, padded.
     width: usize,
-    /// Of each four stages; none if springs or forces are to be evaluated, one stage after the other.
-    mechanics: Vec<Mechanics<Lanes>>,
+    /// Of each `N` stages; none if springs or forces are to be evaluated, one stage after the other.
+    mechanics: Vec<Mechanics<LanesOf<N>>>,
     /// `μ_ij`, row after row, padded both ways.
-    rows: Vec<Lanes>,
+    rows: Vec<LanesOf<N>>,
     /// `μ_ij`, column after column.
-    columns: Vec<Lanes>,
+    columns: Vec<LanesOf<N>>,
     weights: Vec<f64>,
     nodes: Vec<f64>,
     /// Lengths of the stages `h b_i`, and their inverses.
@@ -78,16 +79,16 @@ pub(crate) struct System {
     impulse: Vec<f64>,
     momentum: Vec<f64>,
     held: Vec<f64>,
-    /// Configurations and velocities of each four stages, one coordinate after the other.
-    q: Vec<Lanes>,
-    velocity: Vec<Lanes>,
-    l_q: Vec<Lanes>,
-    l_v: Vec<Lanes>,
-    pub(crate) balls: Option<Box<Balls>>,
+    /// Configurations and velocities of each `N` stages, one coordinate after the other.
+    q: Vec<LanesOf<N>>,
+    velocity: Vec<LanesOf<N>>,
+    l_q: Vec<LanesOf<N>>,
+    l_v: Vec<LanesOf<N>>,
+    pub(crate) balls: Option<Box<Balls<N>>>,
     pub(crate) closures: Option<Box<Closures>>,
-    /// `L_q + f` of each four stages, with ball joints.
-    force: Vec<Lanes>,
-    alike: Option<Alike>,
+    /// `L_q + f` of each `N` stages, with ball joints.
+    force: Vec<LanesOf<N>>,
+    alike: Option<Alike<N>>,
     /// With ball joints, all derivatives.
     pub(crate) slopes: Option<Box<Slopes>>,
     hessian: Hessian,
@@ -97,14 +98,14 @@ pub(crate) struct System {
     residual: Vec<f64>,
 }
 
-impl System {
+impl<const N: usize> System<N> {
     /// `by_masses`: for a solution with the mass matrices of the stages.
     pub(crate) fn new(model: &Model, tableau: &Tableau, by_masses: bool) -> Self {
         let d = model.dimensions;
         let has_balls = !model.orientations.is_empty();
         let count = tableau.nodes.len();
-        let width = count.next_multiple_of(Lanes::COUNT);
-        let groups = width / Lanes::COUNT;
+        let width = count.next_multiple_of(N);
+        let groups = width / N;
         let is_simple = !model.potentials.any && model.forces.is_none();
         let padded = |numbers: &[f64]| {
             let mut numbers = numbers.to_vec();
@@ -114,12 +115,12 @@ impl System {
         let coupling = |i: usize, j: usize| {
             if i < count && j < count { tableau.coupling[i * count + j] } else { 0.0 }
         };
-        let four = |entry: &dyn Fn(usize) -> f64| LanesOf([0, 1, 2, 3].map(entry));
-        let entries = (0..width).flat_map(|i| (0..width).step_by(4).map(move |j| (i, j)));
-        let rows = entries.clone().map(|(i, j)| four(&|lane| coupling(i, j + lane))).collect();
-        let columns = entries.map(|(j, i)| four(&|lane| coupling(i + lane, j))).collect();
+        let several = |entry: &dyn Fn(usize) -> f64| LanesOf(array::from_fn(entry));
+        let entries = (0..width).flat_map(|i| (0..width).step_by(N).map(move |j| (i, j)));
+        let rows = entries.clone().map(|(i, j)| several(&|lane| coupling(i, j + lane))).collect();
+        let columns = entries.map(|(j, i)| several(&|lane| coupling(i + lane, j))).collect();
         let zeros = || vec![0.0; d.dynamic * width];
-        let lanes = |count: usize| vec![Lanes::ZERO; count];
+        let lanes = |count: usize| vec![LanesOf::ZERO; count];
         Self {
             count,
             width,
@@ -161,15 +162,15 @@ impl System {
         }
     }
 
-    /// How many times four stages there are.
+    /// How many times `N` stages there are.
     fn groups(&self) -> usize {
-        self.width / Lanes::COUNT
+        self.width / N
     }
 
-    /// `Σ_j μ_ij x_j` for four stages `i`.
+    /// `Σ_j μ_ij x_j` for `N` stages `i`.
     #[inline(always)]
-    fn coupled(columns: &[Lanes], groups: usize, g: usize, x: &[f64]) -> Lanes {
-        let mut sum = Lanes::ZERO;
+    fn coupled(columns: &[LanesOf<N>], groups: usize, g: usize, x: &[f64]) -> LanesOf<N> {
+        let mut sum = LanesOf::ZERO;
         for (column, x) in columns.chunks_exact(groups).zip(x) {
             sum += column[g] * *x;
         }
@@ -183,8 +184,8 @@ impl System {
 
     /// Places a workspace at a stage.
     pub(crate) fn place(&self, workspace: &mut Workspace, state: &PreciseState, stage: usize) {
-        let (n, lane) = (state.q.len(), stage % Lanes::COUNT);
-        let at = stage / Lanes::COUNT * n;
+        let (n, lane) = (state.q.len(), stage % N);
+        let at = stage / N * n;
         for (a, (q, v)) in self.q[at..].iter().zip(&self.velocity[at..]).take(n).enumerate() {
             let per_radian = workspace.mid.turns_per_radian.get(a).copied().unwrap_or_default();
             let turns = state.q[a] - without_turns(state.q[a], per_radian)[0];
@@ -200,7 +201,7 @@ impl System {
     /// Replaces the velocities of ball joints at a stage by the rates of `η`.
     pub(crate) fn take_rates(&self, stage: usize, velocity: &mut [f64]) {
         let Some(balls) = &self.balls else { return };
-        let (n, g) = (velocity.len(), stage / Lanes::COUNT);
+        let (n, g) = (velocity.len(), stage / N);
         for (o, &c) in balls.coordinates.iter().enumerate() {
             let [_, rate] = balls.at(o, stage, &self.q[g * n..][..n]);
             velocity[c..c + 3].copy_from_slice(&rate.0);
@@ -243,9 +244,9 @@ impl System {
             let start = state.q[nd + k];
             let way = u[d.inputs + k] - start;
             for g in 0..self.groups() {
-                let node = Lanes::load(&self.nodes[g * Lanes::COUNT..]);
+                let node = LanesOf::load(&self.nodes[g * N..]);
                 self.q[g * n + nd + k] = node * way + start;
-                self.velocity[g * n + nd + k] = Lanes::constant(way / h);
+                self.velocity[g * n + nd + k] = LanesOf::constant(way / h);
             }
         }
     }
@@ -265,14 +266,14 @@ impl System {
         }
         for g in 0..self.groups() {
             self.move_to(state, &workspace.mid.turns_per_radian, n, g);
-            let first = g * Lanes::COUNT;
+            let first = g * N;
             if let Some(balls) = &mut self.balls {
                 let place = [&mut self.q[g * n..][..n], &mut self.velocity[g * n..][..n]];
-                balls.move_to(&self.increment, Lanes::load(&self.rates[first..]), g, place);
+                balls.move_to(&self.increment, LanesOf::load(&self.rates[first..]), g, place);
             }
             if self.mechanics.is_empty() {
-                for lane in 0..Lanes::COUNT.min(self.count - g * Lanes::COUNT) {
-                    self.evaluate_alone(workspace, at, inputs, g * Lanes::COUNT + lane);
+                for lane in 0..N.min(self.count - g * N) {
+                    self.evaluate_alone(workspace, at, inputs, g * N + lane);
                 }
             } else {
                 let (q, velocity) = (&self.q[g * n..][..n], &self.velocity[g * n..][..n]);
@@ -283,7 +284,7 @@ impl System {
             }
             magnitude = magnitude.max(self.take_impulses(state, &model.damping, n, g));
             if let Some(balls) = &mut self.balls {
-                let lengths = Lanes::load(&self.lengths[first..]);
+                let lengths = LanesOf::load(&self.lengths[first..]);
                 let from = (&self.force[g * nd..][..nd], &self.l_v[g * nd..][..nd]);
                 balls.take(lengths, g, from, [&mut self.impulse, &mut self.momentum]);
             }
@@ -295,11 +296,11 @@ impl System {
         magnitude
     }
 
-    /// Configurations and velocities of four stages.
+    /// Configurations and velocities of `N` stages.
     pub(crate) fn move_to(&mut self, state: &PreciseState, per_radian: &[f64], n: usize, g: usize) {
-        wide!({
-            let first = g * Lanes::COUNT;
-            let rates = Lanes::load(&self.rates[first..]);
+        in_registers!(LanesOf<N>, {
+            let first = g * N;
+            let rates = LanesOf::load(&self.rates[first..]);
             for (a, per_radian) in per_radian.iter().enumerate() {
                 let own = &self.increment[a * self.width..][..self.width];
                 let groups = self.groups();
@@ -307,12 +308,12 @@ impl System {
                     Self::coupled(&self.columns, groups, g, &own[..self.count]) + state.q_low[a];
                 let [angle, rest] = without_turns(state.q[a], *per_radian);
                 self.q[g * n + a] = more + rest + angle;
-                self.velocity[g * n + a] = Lanes::load(&own[first..]) * rates;
+                self.velocity[g * n + a] = LanesOf::load(&own[first..]) * rates;
             }
         })
     }
 
-    /// Impulses of four stages, from the derivatives of `L`.
+    /// Impulses of `N` stages, from the derivatives of `L`.
     pub(crate) fn take_impulses(
         &mut self,
         state: &PreciseState,
@@ -320,15 +321,15 @@ impl System {
         n: usize,
         g: usize,
     ) -> f64 {
-        wide!({
-            let first = g * Lanes::COUNT;
-            let lengths = Lanes::load(&self.lengths[first..]);
-            let mut largest = [0.0; Lanes::COUNT];
+        in_registers!(LanesOf<N>, {
+            let first = g * N;
+            let lengths = LanesOf::load(&self.lengths[first..]);
+            let mut largest = [0.0; N];
             let nd = state.p.len();
             let derivatives = self.l_q[g * nd..][..nd].iter().zip(&self.l_v[g * nd..]);
             for (a, (l_q, l_v)) in derivatives.enumerate() {
                 let at = a * self.width + first;
-                let mut force = Lanes::load(&self.held[at..]);
+                let mut force = LanesOf::load(&self.held[at..]);
                 if let Some(c) = damping.get(a) {
                     force -= self.velocity[g * n + a] * *c;
                 }
@@ -369,44 +370,44 @@ impl System {
 
     /// The residuals, as if there were neither ball joints nor constraints.
     fn find_linear_residuals(&mut self, state: &PreciseState) -> f64 {
-        wide!({
-            let (groups, mut sizes) = (self.groups(), Lanes::ZERO);
+        in_registers!(LanesOf<N>, {
+            let (groups, mut sizes) = (self.groups(), [0.0; N]);
             for (a, residual) in self.residual.chunks_exact_mut(self.count).enumerate() {
                 let own = &self.impulse[a * self.width..][..self.width];
-                for (g, residual) in residual.chunks_mut(Lanes::COUNT).enumerate() {
-                    let first = g * Lanes::COUNT;
+                for (g, residual) in residual.chunks_mut(N).enumerate() {
+                    let first = g * N;
                     let sum = Self::coupled(&self.columns, groups, g, &own[..self.count]);
-                    let momentum = Lanes::load(&self.momentum[a * self.width + first..]);
+                    let momentum = LanesOf::load(&self.momentum[a * self.width + first..]);
                     let value = (-momentum + state.p[a] + sum) + state.p_low[a];
                     value.store_some(residual);
-                    for (size, value) in sizes.0.iter_mut().zip(&*residual) {
+                    for (size, value) in sizes.iter_mut().zip(&*residual) {
                         *size = larger(*size, *value);
                     }
                 }
             }
-            sizes.0.into_iter().fold(0.0, larger)
+            sizes.into_iter().fold(0.0, larger)
         })
     }
 
     /// Takes the last correction, which `residual` holds, into the impulses, which were evaluated
     /// before it.
     pub(crate) fn correct_impulses(&mut self, n: usize) {
-        wide!({
+        in_registers!(LanesOf<N>, {
             let (count, width, groups) = (self.count, self.width, self.groups());
             let nd = self.increment.len() / width;
             for g in 0..groups {
-                let first = g * Lanes::COUNT;
-                let lengths = Lanes::load(&self.lengths[first..]);
+                let first = g * N;
+                let lengths = LanesOf::load(&self.lengths[first..]);
                 for b in 0..nd {
                     let corrections = &self.residual[b * count..][..count];
                     let moved = Self::coupled(&self.columns, groups, g, corrections);
-                    let own = Lanes::load_some(&corrections[first..]);
+                    let own = LanesOf::load_some(&corrections[first..]);
                     for a in 0..nd {
                         let at = (a * n + b) * width + first;
-                        let by_position = Lanes::load(&self.hessian.qq[at..]) * moved * lengths;
-                        let by_velocity = Lanes::load(&self.hessian.qv[at..]) * own;
+                        let by_position = LanesOf::load(&self.hessian.qq[at..]) * moved * lengths;
+                        let by_velocity = LanesOf::load(&self.hessian.qv[at..]) * own;
                         let impulse = &mut self.impulse[a * width + first..];
-                        (Lanes::load(impulse) - (by_position + by_velocity)).store(impulse);
+                        (LanesOf::load(impulse) - (by_position + by_velocity)).store(impulse);
                     }
                 }
             }
@@ -433,7 +434,7 @@ impl System {
     }
 
     fn fill_stages(&mut self, n: usize) {
-        wide!({
+        in_registers!(LanesOf<N>, {
             match self.groups() {
                 1 => self.fill_groups::<1>(n),
                 _ => self.fill_groups::<2>(n),
@@ -455,7 +456,7 @@ impl System {
             }
         }
         for stage in 0..count {
-            let (g, lane) = (stage / Lanes::COUNT, stage % Lanes::COUNT);
+            let (g, lane) = (stage / N, stage % N);
             for a in 0..nd {
                 slopes.torque[stage * nd + a] = self.force[g * nd + a].0[lane];
                 slopes.momentum[stage * nd + a] = self.l_v[g * nd + a].0[lane];
@@ -501,7 +502,7 @@ impl System {
         }
         self.place(workspace, state, stage);
         workspace.mid.evaluate(model);
-        let (first, lane) = (stage / Lanes::COUNT * d.dynamic, stage % Lanes::COUNT);
+        let (first, lane) = (stage / N * d.dynamic, stage % N);
         for a in 0..d.dynamic {
             // Forces count as a part of `L_q`; those of inputs and dampers are added to all stages.
             let damping = model.damping.get(a).map_or(0.0, |c| c * workspace.mid.velocity[a]);
@@ -651,7 +652,7 @@ impl System {
     /// Factors what is alike in all rounds at the last evaluation; false if that is singular.
     fn factor_alike(
         &mut self,
-        alike: &mut Alike,
+        alike: &mut Alike<N>,
         workspace: &mut Workspace,
         at: StepContext<'_>,
         inputs: &[f64],
@@ -671,7 +672,7 @@ impl System {
     /// Factors the mass matrices at the last evaluation.
     fn factor_masses(
         &mut self,
-        masses: &mut Masses,
+        masses: &mut Masses<N>,
         workspace: &mut Workspace,
         at: StepContext<'_>,
         inputs: &[f64],
@@ -684,7 +685,7 @@ impl System {
             }
         }
         for (g, mechanics) in self.mechanics.iter_mut().enumerate() {
-            masses.take(at.model, mechanics, g * Lanes::COUNT);
+            masses.take(at.model, mechanics, g * N);
         }
         masses.factor(at.model);
     }
@@ -694,7 +695,7 @@ impl System {
         &mut self,
         workspace: &mut Workspace,
         model: &Model,
-        alike: &mut Alike,
+        alike: &mut Alike<N>,
         is_first: bool,
     ) -> f64 {
         let changes = match (alike, &mut self.closures) {
@@ -716,13 +717,13 @@ impl System {
     }
 
     /// From the residuals to changes of the increments, with the mass matrices.
-    fn change_by_masses(&mut self, model: &Model, masses: &mut Masses, is_first: bool) {
+    fn change_by_masses(&mut self, model: &Model, masses: &mut Masses<N>, is_first: bool) {
         for g in 0..self.groups() {
-            let first = g * Lanes::COUNT;
+            let first = g * N;
             for (right, residual) in
                 masses.right.iter_mut().zip(self.residual.chunks_exact(self.count))
             {
-                *right = Lanes::load_some(&residual[first..]);
+                *right = LanesOf::load_some(&residual[first..]);
             }
             if let Some(balls) = &self.balls {
                 balls.change_axes(&mut masses.right, g, false);
@@ -731,7 +732,7 @@ impl System {
             if let Some(balls) = &self.balls {
                 balls.change_axes(&mut masses.right, g, true);
             }
-            let lengths = Lanes::load(&self.lengths[first..]);
+            let lengths = LanesOf::load(&self.lengths[first..]);
             for (own, velocity) in self.residual.chunks_exact_mut(self.count).zip(&masses.right) {
                 let change = *velocity * lengths;
                 change.store_some(&mut own[first..]);
@@ -760,17 +761,17 @@ impl System {
             }
         }
         for (g, mechanics) in self.mechanics.iter_mut().enumerate() {
-            self.hessian.take(model, mechanics, g * Lanes::COUNT);
+            self.hessian.take(model, mechanics, g * N);
         }
     }
 
     #[inline(always)]
     fn fill_groups<const GROUPS: usize>(&mut self, n: usize) {
-        let (count, width) = (self.count, GROUPS * Lanes::COUNT);
+        let (count, width) = (self.count, GROUPS * N);
         let nd = self.increment.len() / width;
         let Self { hessian, matrix, rows, lengths, rates, .. } = self;
-        let load = |numbers: &[f64]| -> [Lanes; GROUPS] {
-            std::array::from_fn(|g| Lanes::load(&numbers[g * Lanes::COUNT..]))
+        let load = |numbers: &[f64]| -> [LanesOf<N>; GROUPS] {
+            std::array::from_fn(|g| LanesOf::load(&numbers[g * N..]))
         };
         let lengths = load(lengths);
         let rows = rows.as_chunks::<GROUPS>().0;
@@ -781,20 +782,20 @@ impl System {
                 let (vq, vv) = (&hessian.vq[at..][..count], &hessian.vv[at..][..count]);
                 for (i, (row, vq)) in rows.iter().zip(vq).enumerate() {
                     let target = &mut matrix.matrix[(a * count + i) * matrix.stride + b * count..];
-                    let mut sums = [Lanes::ZERO; GROUPS];
+                    let mut sums = [LanesOf::ZERO; GROUPS];
                     for g in 0..GROUPS {
                         sums[g] = row[g] * (qv[g] - *vq);
                     }
                     for j in 0..GROUPS {
                         let weights = row[j] * (lengths[j] * qq[j]);
-                        for (row, weight) in rows[j * Lanes::COUNT..].iter().zip(weights.0) {
+                        for (row, weight) in rows[j * N..].iter().zip(weights.0) {
                             for g in 0..GROUPS {
                                 sums[g] += row[g] * weight;
                             }
                         }
                     }
                     for (g, sum) in sums.into_iter().enumerate() {
-                        sum.store(&mut target[g * Lanes::COUNT..]);
+                        sum.store(&mut target[g * N..]);
                     }
                     target[i] -= rates[i] * vv[i];
                 }
@@ -840,7 +841,7 @@ impl System {
             }
             // Angular velocities are the same in any chart.
             for (i, a) in (0..count).flat_map(|i| (c..c + 3).map(move |a| (i, a))) {
-                let (g, lane) = (i / Lanes::COUNT, i % Lanes::COUNT);
+                let (g, lane) = (i / N, i % N);
                 motion[i * nd + a] = self.velocity[g * model.dimensions.coordinates() + a].0[lane];
             }
         }

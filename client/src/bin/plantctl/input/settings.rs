@@ -13,7 +13,7 @@ pub(crate) struct Settings {
     /// Put all forces at the start of a step, as the paper does.
     #[arg(long)]
     pub(crate) paper: bool,
-    /// Order of accuracy: 2, 4, 6, 8, or 12 without constraints; 2 if not given.
+    /// Order of accuracy: 2, 4, 6, 8, 12 or 16; 2 if not given.
     #[arg(long, value_name = "ORDER")]
     pub(crate) order: Option<u32>,
     /// Steps of the method in a time step.
