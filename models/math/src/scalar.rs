@@ -135,6 +135,10 @@ pub trait Scalar:
     fn constant(value: f64) -> Self;
     /// The real part.
     fn value(self) -> f64;
+    /// The magnitude of the real part; of several numbers side by side the largest.
+    fn magnitude(self) -> f64 {
+        self.value().abs()
+    }
     /// Whether it is several numbers side by side: then all code pays in wide registers.
     const IS_SEVERAL: bool = false;
     /// Runs a block in registers that suit these numbers; see [`wide!`].
@@ -175,6 +179,8 @@ pub trait Scalar:
     fn sqrt(self) -> Self;
     /// `1 / x`.
     fn recip(self) -> Self;
+    /// `√x` and `1 / √x`; both are zero, and constant, where `x` is.
+    fn roots(self) -> [Self; 2];
     /// `tanh x`.
     fn tanh(self) -> Self;
     /// With the sign of another number.
@@ -244,6 +250,11 @@ impl Scalar for f64 {
         self.recip()
     }
     #[inline(always)]
+    fn roots(self) -> [Self; 2] {
+        let root = self.sqrt();
+        [root, if self == 0.0 { 0.0 } else { root.recip() }]
+    }
+    #[inline(always)]
     fn tanh(self) -> Self {
         libm::tanh(self)
     }
@@ -296,6 +307,12 @@ impl<S: Scalar> Scalar for Dual<S> {
     fn sqrt(self) -> Self {
         let root = self.re.sqrt();
         Self::new(root, self.eps * root.recip() * 0.5)
+    }
+    #[inline(always)]
+    fn roots(self) -> [Self; 2] {
+        let [root, inverse] = self.re.roots();
+        let slope = self.eps * inverse * 0.5;
+        [Self::new(root, slope), Self::new(inverse, -(slope * inverse * inverse))]
     }
     #[inline(always)]
     fn recip(self) -> Self {
@@ -426,6 +443,14 @@ impl<const N: usize> Scalar for LanesOf<N> {
     #[inline(always)]
     fn recip(self) -> Self {
         self.each(f64::recip)
+    }
+    #[inline(always)]
+    fn roots(self) -> [Self; 2] {
+        [self.each(f64::sqrt), self.each(|x| x.roots()[1])]
+    }
+    #[inline(always)]
+    fn magnitude(self) -> f64 {
+        self.0.into_iter().fold(0.0, |most, x| most.max(x.abs()))
     }
     #[inline(always)]
     fn tanh(self) -> Self {

@@ -4,7 +4,7 @@
 //! of equations along axes are summed up as forces on what joints carry.
 
 use plantd_math::norms::larger;
-use plantd_math::scalar::Scalar;
+use plantd_math::scalar::{Scalar, in_registers};
 use plantd_math::spatial::{Mat3, Vec3, three};
 
 use crate::constraints::in_plane::InPlane;
@@ -54,7 +54,7 @@ pub(crate) struct Closure<S: Scalar = f64> {
 #[inline(always)]
 fn moved<S: Scalar>(row: &[S], q: &[S]) -> f64 {
     let ((rows, row), (all, q)) = (row.as_chunks::<4>(), q.as_chunks::<4>());
-    let product = |entry: S, q: S| (entry * q).value().abs();
+    let product = |entry: S, q: S| (entry * q).magnitude();
     let mut sums = [0.0; 4];
     for (row, q) in rows.iter().zip(all) {
         for (sum, (entry, q)) in sums.iter_mut().zip(row.iter().zip(q)) {
@@ -130,41 +130,45 @@ impl<S: Scalar> Closure<S> {
     pub(crate) fn evaluate(&mut self, model: &Model, q: &[S], orientations: &[Mat3<S>]) {
         self.known = Known::Nothing;
         self.poses.evaluate(&model.closure, q, orientations);
-        let at = Place { tree: &model.closure, poses: &self.poses, q };
-        let mut c = 0;
-        while let Some(constraint) = model.constraints.get(c) {
-            let together = c..c + constraint.count();
-            let magnitude = constraint.value(at, &mut self.value[together.clone()]);
-            for c in together.clone() {
-                // Not less than what the smallest numbers are rounded by: some terms may all be zero.
-                self.round_off[c] =
-                    f64::EPSILON * magnitude + self.coordinate_round_off[c] + f64::MIN_POSITIVE;
+        in_registers!(S, {
+            let at = Place { tree: &model.closure, poses: &self.poses, q };
+            let mut c = 0;
+            while let Some(constraint) = model.constraints.get(c) {
+                let together = c..c + constraint.count();
+                let magnitude = constraint.value(at, &mut self.value[together.clone()]);
+                for c in together.clone() {
+                    // Not less than what the smallest numbers are rounded by: some terms may all be zero.
+                    self.round_off[c] =
+                        f64::EPSILON * magnitude + self.coordinate_round_off[c] + f64::MIN_POSITIVE;
+                }
+                c = together.end;
             }
-            c = together.end;
-        }
+        })
     }
 
     /// Takes over how round-off of the coordinates changes the values, until the next Jacobian.
-    pub(crate) fn expect_round_off_of(&mut self, other: &Self) {
+    pub(crate) fn expect_round_off_of<T: Scalar>(&mut self, other: &Closure<T>) {
         self.coordinate_round_off.copy_from_slice(&other.coordinate_round_off);
     }
 
     /// Jacobian at the configuration of the last [`Closure::evaluate`].
     #[inline(never)]
     pub(crate) fn differentiate(&mut self, model: &Model, q: &[S]) {
-        let n = model.dimensions.coordinates();
-        let at = Place { tree: &model.closure, poses: &self.poses, q };
-        self.jacobian.fill(S::ZERO);
         self.unturned.clear();
-        let mut c = 0;
-        while let Some(constraint) = model.constraints.get(c) {
-            constraint.differentiate(at, &mut self.jacobian[c * n..]);
-            c += constraint.count();
-        }
-        let rows = self.jacobian.chunks_exact(n).zip(&mut self.coordinate_round_off);
-        for (row, round_off) in rows {
-            *round_off = f64::EPSILON * moved(row, q);
-        }
+        in_registers!(S, {
+            let n = model.dimensions.coordinates();
+            let at = Place { tree: &model.closure, poses: &self.poses, q };
+            self.jacobian.fill(S::ZERO);
+            let mut c = 0;
+            while let Some(constraint) = model.constraints.get(c) {
+                constraint.differentiate(at, &mut self.jacobian[c * n..]);
+                c += constraint.count();
+            }
+            let rows = self.jacobian.chunks_exact(n).zip(&mut self.coordinate_round_off);
+            for (row, round_off) in rows {
+                *round_off = f64::EPSILON * moved(row, q);
+            }
+        })
     }
 
     /// Largest violation in units of its round-off.

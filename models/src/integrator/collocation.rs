@@ -195,5 +195,5 @@ fn explain(workspace: &mut Workspace, at: StepContext<'_>, error: StepError) -> 
     if at.model.dimensions.constraints > 0 {
         workspace.prepare(at);
     }
-    at.model.explain(error, at.state, &workspace.step.q_end)
+    at.model.explain(error, at, &workspace.step.q_end)
 }

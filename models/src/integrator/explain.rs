@@ -8,7 +8,7 @@ use crate::constraints::conditioning::{
 };
 use crate::constraints::projection::Reached;
 use crate::integrator::report::StepError;
-use crate::integrator::state::PreciseState;
+use crate::integrator::workspace::StepContext;
 use crate::model::mechanism::Model;
 
 impl Model {
@@ -58,12 +58,11 @@ impl Model {
         StepError::SingularConstraints { constraints, reciprocal_condition }
     }
 
-    /// Why a step from `state` to the prescribed positions in `q_end` could not be solved, where the
-    /// constraints are the reason.
+    /// Why a step to the prescribed positions in `q_end` could not be solved, where the constraints are the reason.
     pub(crate) fn explain(
         &self,
         error: StepError,
-        state: &PreciseState,
+        StepContext { settings, state, .. }: StepContext<'_>,
         q_end: &[f64],
     ) -> StepError {
         let unsolved =
@@ -84,12 +83,14 @@ impl Model {
         // Is there a configuration that satisfies the constraints at the end of the step?
         let mut q = state.q.clone();
         q[self.dimensions.dynamic..].copy_from_slice(&q_end[self.dimensions.dynamic..]);
-        match conditioning.approach(self, &mut closure, &mut q, VIOLATED) {
+        // Where it begins they may be violated by as much as steps leave.
+        let enough = VIOLATED.max(settings.precision.residual());
+        match conditioning.approach(self, &mut closure, &mut q, enough) {
             Reached::Violated => {
                 let relative = |c: usize| (closure.value[c] / closure.round_off[c]).abs();
                 let names = self.constraint_names.iter().enumerate();
                 let constraints = names
-                    .filter(|(c, _)| relative(*c) > VIOLATED)
+                    .filter(|(c, _)| relative(*c) > enough)
                     .map(|(_, n)| n.clone())
                     .collect();
                 let violation = closure.value.iter().fold(0.0_f64, |a, v| a.max(v.abs()));

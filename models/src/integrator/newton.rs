@@ -146,7 +146,7 @@ impl Workspace {
         }
         self.ballistic(model, settings, state);
         self.iterate::<BODIES>(model, settings, state, true)
-            .map_err(|error| model.explain(error, state, &self.step.q_end))
+            .map_err(|error| model.explain(error, at, &self.step.q_end))
     }
 
     /// What does not change within a step: prescribed motion, input forces, constraints at the start.

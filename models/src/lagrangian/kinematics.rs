@@ -277,7 +277,7 @@ impl<S: Scalar> Poses<S> {
     }
 
     /// A point relative to the origin of its tree, and that origin.
-    #[inline]
+    #[inline(always)]
     pub(crate) fn point(&self, tree: &Tree, at: &Attachment) -> (Vec3<S>, Vec3<S>) {
         let point = Vec3::lift(at.point);
         if at.joint == WORLD {

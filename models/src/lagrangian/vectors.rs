@@ -29,7 +29,7 @@ impl PointPair {
     }
 
     /// The separation of the points. Origins cancel exactly within one tree.
-    #[inline]
+    #[inline(always)]
     pub(crate) fn separation<S: Scalar>(&self, tree: &Tree, poses: &Poses<S>) -> Separation<S> {
         let (a, origin_a) = poses.point(tree, &self.a);
         let (b, origin_b) = poses.point(tree, &self.b);
@@ -44,8 +44,9 @@ impl PointPair {
 }
 
 /// Length of the real part.
+#[inline(always)]
 fn size<S: Scalar>(v: Vec3<S>) -> f64 {
-    Vec3(v.0.map(S::value)).norm()
+    Vec3(v.0.map(S::magnitude)).norm()
 }
 
 impl PathJoint {
@@ -135,12 +136,7 @@ impl<'a, S: Scalar> Distance<'a, S> {
     pub(crate) fn new(pair: &'a PointPair, tree: &'a Tree, poses: &'a Poses<S>) -> Self {
         let at = pair.separation(tree, poses);
         let square = at.difference.dot(at.difference);
-        let (length, inverse) = if square.value() == 0.0 {
-            (S::ZERO, S::ZERO)
-        } else {
-            let length = square.sqrt();
-            (length, length.recip())
-        };
+        let [length, inverse] = square.roots();
         Self { pair, tree, poses, direction: at.difference * inverse, at, inverse, length }
     }
 

@@ -76,6 +76,7 @@ impl<const N: usize> System<N> {
         tangents.inputs.copy_from_slice(inputs);
         workspace.prepare(at);
         if let Some(closures) = &mut self.closures {
+            closures.spread();
             closures.curve(model, true);
         }
         self.fill_matrix(at);
@@ -159,12 +160,11 @@ impl<const N: usize> System<N> {
 }
 
 impl NodeTangents {
-    fn new(closures: &Closures, theta: &Parameters) -> Self {
+    fn new<const N: usize>(closures: &Closures<N>, theta: &Parameters) -> Self {
         let zeros = |len: usize| vec![0.0; len];
-        let jacobians = closures.at.iter().map(|at| at.jacobian.len()).sum();
         Self {
             q: zeros(closures.q.len()),
-            jacobians: zeros(jacobians),
+            jacobians: zeros(closures.jacobians.len()),
             multipliers: zeros(closures.multipliers.len()),
             tangent: zeros(closures.multipliers.len() * theta.stride),
             responses: zeros(closures.responses.len()),
@@ -174,11 +174,10 @@ impl NodeTangents {
     }
 
     /// Takes the nodes of the solution.
-    fn take(&mut self, closures: &Closures, closing: Option<&Closing>) {
+    fn take<const N: usize>(&mut self, closures: &Closures<N>, closing: Option<&Closing>) {
         self.closing = closing.map(|closing| Box::new(closing.clone()));
         self.q.copy_from_slice(&closures.q);
-        let nodes = self.jacobians.chunks_exact_mut(closures.at[0].jacobian.len().max(1));
-        nodes.zip(&closures.at).for_each(|(to, at)| to.copy_from_slice(&at.jacobian));
+        self.jacobians.copy_from_slice(&closures.jacobians);
         self.multipliers.copy_from_slice(&closures.multipliers);
         self.responses.copy_from_slice(&closures.responses);
         self.schur.take_factors_of(&closures.schur);

@@ -263,6 +263,13 @@ impl<E: Eight, L: Eight> Scalar for Sides<E, L> {
     fn recip(self) -> Self {
         Self::new(E::ONE.over(self.0))
     }
+    fn roots(self) -> [Self; 2] {
+        [self.sqrt(), self.each(|x| x.roots()[1])]
+    }
+    #[inline(always)]
+    fn magnitude(self) -> f64 {
+        LanesOf(self.block().0).magnitude()
+    }
     fn tanh(self) -> Self {
         self.each(libm::tanh)
     }

@@ -21,7 +21,7 @@ impl Equation for Coupling {
         for term in &self.terms {
             let term = term.value(q);
             value += term;
-            magnitude += term.value().abs();
+            magnitude += term.magnitude();
         }
         values[0] = value;
         magnitude

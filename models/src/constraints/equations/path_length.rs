@@ -20,7 +20,7 @@ impl Equation for PathLength {
     #[inline(never)]
     fn value<S: Scalar>(&self, Place { tree, poses, q }: Place<'_, S>, values: &mut [S]) -> f64 {
         let length = self.length.at(q);
-        let (mut value, mut magnitude) = (-length, length.value());
+        let (mut value, mut magnitude) = (-length, length.magnitude());
         for segment in &self.segments {
             let segment = Distance::new(segment, tree, poses);
             value += segment.length;

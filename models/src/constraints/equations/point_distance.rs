@@ -23,7 +23,7 @@ impl Equation for PointDistance {
         let square = at.difference.dot(at.difference);
         let squared_length = length * length;
         values[0] = square - squared_length;
-        2.0 * square.value().sqrt() * at.magnitude + squared_length.value()
+        2.0 * square.magnitude().sqrt() * at.magnitude + squared_length.magnitude()
     }
 
     #[inline(always)]

@@ -74,18 +74,19 @@ pub(crate) struct Balls<const N: usize> {
     /// `h b_i exp(η) (τ + f)`, as numbers of coordinates are.
     torque: Vec<f64>,
     /// With constraints.
-    nodes: Option<Box<Nodes>>,
+    nodes: Option<Box<Nodes<N>>>,
 }
 
 /// The ball joints where constraints hold.
 #[derive(Clone, Debug)]
-struct Nodes {
-    /// `κ_jk − ½`, node after node.
-    skew: Vec<f64>,
-    /// Of each node, joint after joint.
-    charts: Vec<Chart>,
-    /// At the node that was moved to last.
-    orientations: Vec<Mat3>,
+struct Nodes<const N: usize> {
+    /// `κ_jk − ½` of the start, and of each `N` nodes after it side by side, stage after stage.
+    start_skew: Vec<f64>,
+    skew: Vec<LanesOf<N>>,
+    /// Of the start, and of each `N` nodes, joint after joint.
+    start_charts: Vec<Chart>,
+    charts: Vec<Chart<LanesOf<N>>>,
+    orientations: Vec<Mat3<LanesOf<N>>>,
     /// `Σ exp(η̃) F̃`.
     torque: Vec<Vec3>,
 }
@@ -133,6 +134,10 @@ impl<const N: usize> Balls<N> {
         let entry = |i: usize, j: usize| {
             if i < count { tableau.skew[i * count + j] } else { 0.0 }
         };
+        let from_middle = |j: usize, k: usize| match j < count {
+            true => tableau.reach_from_middle[(j + 1) * count + k],
+            false => 0.0,
+        };
         let columns = (0..count).flat_map(|j| (0..width).step_by(N).map(move |i| (i, j)));
         Self {
             count,
@@ -154,9 +159,14 @@ impl<const N: usize> Balls<N> {
             torque: vec![0.0; 3 * no * width],
             nodes: (model.dimensions.constraints > 0).then(|| {
                 Box::new(Nodes {
-                    skew: tableau.reach_from_middle.clone(),
-                    charts: vec![Chart::new(Vec3::ZERO); no * tableau.ends.len()],
-                    orientations: vec![Mat3::IDENTITY; no],
+                    start_skew: tableau.reach_from_middle[..count].to_vec(),
+                    skew: (0..width / N)
+                        .flat_map(|g| (0..count).map(move |k| (g, k)))
+                        .map(|(g, k)| LanesOf(array::from_fn(|lane| from_middle(g * N + lane, k))))
+                        .collect(),
+                    start_charts: vec![Chart::new(Vec3::ZERO); no],
+                    charts: vec![Chart::new(Vec3::ZERO); stages],
+                    orientations: vec![Mat3::IDENTITY; stages],
                     torque: vec![Vec3::ZERO; no],
                 })
             }),
@@ -221,38 +231,74 @@ impl<const N: usize> Balls<N> {
         &self.centers
     }
 
-    /// Moves to a node of the constraints, where the orientations are returned.
-    pub(super) fn move_to_node(&mut self, increment: &[f64], j: usize) -> &[Mat3] {
-        let Self { nodes: Some(nodes), coordinates, centers, count, width, .. } = self else {
-            return &[];
-        };
-        let skew = &nodes.skew[j * *count..][..*count];
-        let own = nodes.charts[j * coordinates.len()..].iter_mut().zip(&mut nodes.orientations);
-        for ((c, center), (chart, orientation)) in coordinates.iter().zip(centers).zip(own) {
+    /// Moves to the start, where constraints act, too.
+    pub(super) fn move_to_start(&mut self, increment: &[f64]) {
+        let Some(nodes) = &mut self.nodes else { return };
+        for (c, chart) in self.coordinates.iter().zip(&mut nodes.start_charts) {
             *chart = Chart::new(Vec3([0, 1, 2].map(|a| {
-                let numbers = &increment[(c + a) * *width..][..*count];
-                skew.iter().zip(numbers).map(|(s, y)| s * y).sum()
+                let numbers = &increment[(c + a) * self.width..][..self.count];
+                nodes.start_skew.iter().zip(numbers).map(|(s, y)| s * y).sum()
             })));
-            *orientation = center.times(&chart.exp());
         }
-        &nodes.orientations
     }
 
-    /// Takes the impulses of constraints at a node, in the charts from now on.
-    pub(super) fn take_pushes(&mut self, j: usize, pushes: &mut [f64]) {
+    /// Moves to `N` nodes of the constraints after the start, where the orientations are returned.
+    pub(super) fn move_to_nodes(&mut self, increment: &[f64], g: usize) -> &[Mat3<LanesOf<N>>] {
+        let (no, width, count) = (self.coordinates.len(), self.width, self.count);
+        let Self { nodes: Some(nodes), coordinates, centers, .. } = self else { return &[] };
+        let Nodes { skew, charts, orientations, .. } = &mut **nodes;
+        let (charts, orientations) = (&mut charts[g * no..], &mut orientations[g * no..][..no]);
+        in_registers!(LanesOf<N>, {
+            let skew = &skew[g * count..][..count];
+            for (o, (c, center)) in coordinates.iter().zip(centers).enumerate() {
+                let mut offset = [LanesOf::ZERO; 3];
+                for (a, sum) in offset.iter_mut().enumerate() {
+                    for (skew, y) in skew.iter().zip(&increment[(c + a) * width..][..count]) {
+                        *sum += *skew * *y;
+                    }
+                }
+                let chart = Chart::new(Vec3(offset));
+                orientations[o] = Mat3::lift(*center).times(&chart.exp());
+                charts[o] = chart;
+            }
+            &*orientations
+        })
+    }
+
+    /// Takes the impulses of constraints at the start, in the charts from now on.
+    pub(super) fn take_start_pushes(&mut self, pushes: &mut [f64]) {
         let Some(nodes) = &mut self.nodes else { return };
-        let own = nodes.charts[j * self.coordinates.len()..].iter().zip(&mut nodes.torque);
-        for (&c, (chart, torque)) in self.coordinates.iter().zip(own) {
+        for ((&c, chart), torque) in
+            self.coordinates.iter().zip(&nodes.start_charts).zip(&mut nodes.torque)
+        {
             let push = three(pushes, c);
             *torque += chart.exp().apply(push);
             pushes[c..c + 3].copy_from_slice(&chart.dexp().apply_transposed(push).0);
         }
     }
 
+    /// The same at `N` nodes.
+    pub(super) fn take_pushes(&mut self, g: usize, pushes: &mut [LanesOf<N>]) {
+        let Self { nodes: Some(nodes), coordinates, .. } = self else { return };
+        let no = coordinates.len();
+        in_registers!(LanesOf<N>, {
+            let charts = &nodes.charts[g * no..][..no];
+            for ((&c, chart), torque) in coordinates.iter().zip(charts).zip(&mut nodes.torque) {
+                let push = three(pushes, c);
+                let turned = chart.exp().apply(push);
+                *torque += Vec3(turned.0.map(|all| all.0.iter().sum()));
+                pushes[c..c + 3].copy_from_slice(&chart.dexp().apply_transposed(push).0);
+            }
+        })
+    }
+
     /// `η̃` of a joint at a node.
     pub(super) fn at_node(&self, o: usize, j: usize) -> Vec3 {
-        let chart = |nodes: &Nodes| nodes.charts[j * self.coordinates.len() + o].vector();
-        self.nodes.as_deref().map_or(Vec3::ZERO, chart)
+        let Some(nodes) = self.nodes.as_deref() else { return Vec3::ZERO };
+        match j.checked_sub(1) {
+            None => nodes.start_charts[o].vector(),
+            Some(j) => lane(nodes.charts[j / N * self.coordinates.len() + o].vector(), j % N),
+        }
     }
 
     /// Finds where the joints are half-way.

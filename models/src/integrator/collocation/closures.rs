@@ -15,10 +15,13 @@
 //! `B = ∂R/∂Λ` and `G = ∂h/∂Y` corrections take the inverse of `J` and the factors of `S = G J⁻¹ B`, whose dependent
 //! rows are treated as those of the midpoint rule.
 
+use std::array;
+
 use plantd_math::dense_inverse::DenseInverse;
 use plantd_math::norms::larger;
 use plantd_math::pivoted_lu::PivotedLu;
 use plantd_math::rows::{Term, add_rows, padded};
+use plantd_math::scalar::{Compared, LanesOf, Scalar, in_registers};
 use plantd_math::spatial::Mat3;
 
 use crate::constraints::closure::Closure;
@@ -27,28 +30,44 @@ use crate::integrator::collocation::slopes::{Closing, Slopes};
 use crate::integrator::parameters::Parameters;
 use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::scheme::Tableau;
+use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::StepContext;
 use crate::model::mechanism::Model;
 
 /// The constraints of a step.
 #[derive(Clone, Debug)]
-pub(crate) struct Closures {
+pub(crate) struct Closures<const N: usize> {
     /// Stages.
     count: usize,
     /// `c̃_j`, `κ_ji` node after node, and shares of the impulses.
     nodes: Vec<f64>,
     reach: Vec<f64>,
     shares: Vec<f64>,
-    /// The equations at the nodes.
-    pub(crate) at: Vec<Closure>,
-    /// `Q̃_j`, one after the other.
+    /// `κ_ji` of `N` nodes after the start side by side, stage after stage; and of a node, of `N` stages side by side.
+    reach_beside: Vec<LanesOf<N>>,
+    stages_reached: Vec<LanesOf<N>>,
+    /// The equations at the start, and at each `N` nodes after it, side by side.
+    start: Closure,
+    beside: Vec<Closure<LanesOf<N>>>,
+    /// `Q̃_j` of the start, and of each `N` nodes after it.
+    start_q: Vec<f64>,
+    q_beside: Vec<LanesOf<N>>,
+    /// Of all nodes, one after the other, as [`Closures::spread`] finds them: `Q̃_j`, and `Dh`, row-major.
     pub(crate) q: Vec<f64>,
-    /// `Λ_j`, one after the other.
+    pub(crate) jacobians: Vec<f64>,
+    /// `h` at the nodes after the start, one after the other.
+    pub(super) values: Vec<f64>,
+    /// `Λ_j`, one after the other; of `N` nodes side by side.
     pub(crate) multipliers: Vec<f64>,
-    /// `Σ_c Λ_jc D²h_c` at all nodes but the end, square.
+    multipliers_beside: Vec<LanesOf<N>>,
+    /// `Σ_c Λ_jc D²h_c` at all nodes but the end, square; of `N` nodes side by side.
     hessians: Vec<f64>,
-    /// `−Dhᵀ Λ_j`, of ball joints in their charts.
-    pushes: Vec<f64>,
+    hessian_beside: Vec<LanesOf<N>>,
+    /// `−Dhᵀ Λ_j`, of ball joints in their charts: of the start, and of each `N` nodes.
+    start_pushes: Vec<f64>,
+    pushes: Vec<LanesOf<N>>,
+    /// `Σ |Dh_i Λ|` of `N` nodes.
+    sizes: Vec<LanesOf<N>>,
     /// What stages have of the pushes at the start: 1, and of ball joints, which have half of them at the centre, ½.
     whole: Vec<f64>,
     /// Right-hand side, then the last `−ΔΛ`.
@@ -67,12 +86,19 @@ pub(crate) struct Closures {
     terms: Vec<Term>,
 }
 
-impl Closures {
+impl<const N: usize> Closures<N> {
     pub(crate) fn new(model: &Model, tableau: &Tableau) -> Self {
         let d = model.dimensions;
         let (count, nc, nd, n) = (tableau.nodes.len(), d.constraints, d.dynamic, d.coordinates());
         let zeros = |len: usize| vec![0.0; len];
         let stride = padded(count * nc);
+        let groups = count.div_ceil(N);
+        let lanes = |len: usize| vec![LanesOf::ZERO; len];
+        let reach = |j: usize, i: usize| match j <= count && i < count {
+            true => tableau.reach[j * count + i],
+            false => 0.0,
+        };
+        let several = |of: &dyn Fn(usize) -> f64| LanesOf(array::from_fn(of));
         let mut whole = vec![1.0; nd];
         for &c in model.orientations.iter().filter(|c| **c < nd) {
             whole[c..c + 3].fill(0.5);
@@ -83,11 +109,28 @@ impl Closures {
             nodes: tableau.ends.clone(),
             reach: tableau.reach.clone(),
             shares: tableau.shares.clone(),
-            at: vec![Closure::new(model); count + 1],
+            reach_beside: (0..groups)
+                .flat_map(|g| (0..count).map(move |i| (g, i)))
+                .map(|(g, i)| several(&|lane| reach(1 + g * N + lane, i)))
+                .collect(),
+            stages_reached: (0..=count)
+                .flat_map(|j| (0..groups).map(move |g| (j, g)))
+                .map(|(j, g)| several(&|lane| reach(j, g * N + lane)))
+                .collect(),
+            start: Closure::new(model),
+            beside: vec![Closure::new(model); groups],
+            start_q: zeros(n),
+            q_beside: lanes(groups * n),
             q: zeros((count + 1) * n),
+            jacobians: zeros((count + 1) * nc * n),
+            values: zeros(count * nc),
             multipliers: zeros(count * nc),
+            multipliers_beside: lanes(nc),
             hessians: zeros(count * n * n),
-            pushes: zeros(count * nd),
+            hessian_beside: lanes(n * n),
+            start_pushes: zeros(nd),
+            pushes: lanes(groups * nd),
+            sizes: lanes(nd),
             correction: zeros(count * nc),
             turned: zeros(nd),
             gram: room_for_schur(model, 1, 1),
@@ -128,17 +171,20 @@ impl Closures {
     ) {
         let d = model.dimensions;
         let (nd, n) = (d.dynamic, d.coordinates());
-        for (node, q) in self.nodes.iter().zip(self.q.chunks_exact_mut(n)) {
+        for (g, q) in self.q_beside.chunks_exact_mut(n).enumerate() {
             for (k, q) in q[nd..].iter_mut().enumerate() {
                 let (start, next) = (state.q[nd + k], u[d.inputs + k]);
-                *q = if *node == 1.0 { next } else { start + node * (next - start) };
+                *q = LanesOf(array::from_fn(|lane| match self.nodes.get(1 + g * N + lane) {
+                    Some(1.0) => next,
+                    Some(node) => start + node * (next - start),
+                    None => start,
+                }));
             }
         }
-        self.q[..nd].copy_from_slice(&state.q[..nd]);
-        let [start, others @ ..] = &mut self.at[..] else { return };
-        start.evaluate(model, &self.q[..n], orientations);
-        start.differentiate(model, &self.q[..n]);
-        others.iter_mut().for_each(|node| node.expect_round_off_of(start));
+        self.start_q.copy_from_slice(&state.q);
+        self.start.evaluate(model, &self.start_q, orientations);
+        self.start.differentiate(model, &self.start_q);
+        self.beside.iter_mut().for_each(|nodes| nodes.expect_round_off_of(&self.start));
         self.turned.fill(0.0);
         let nodes = self.multipliers.chunks_exact_mut(d.constraints);
         for (multipliers, share) in nodes.zip(&self.shares) {
@@ -149,102 +195,207 @@ impl Closures {
 
     /// Evaluates the constraints where the increments `Y` lead, numbers of a coordinate `width` apart; returns what
     /// impulses are the sums of, at most.
-    pub(super) fn evaluate<const N: usize>(
+    pub(super) fn evaluate(
         &mut self,
         StepContext { model, state, .. }: StepContext<'_>,
         increments: &[f64],
         width: usize,
         mut balls: Option<&mut Balls<N>>,
     ) -> f64 {
-        let d = model.dimensions;
-        let (nd, n, count) = (d.dynamic, d.coordinates(), self.count);
-        for j in 1..=count {
-            let q = &mut self.q[j * n..][..n];
-            let reach = &self.reach[j * count..][..count];
-            for (a, own) in increments.chunks_exact(width).enumerate() {
-                let moved: f64 = own.iter().zip(reach).map(|(y, kappa)| y * kappa).sum();
-                q[a] = state.q[a] + (state.q_low[a] + moved);
-            }
+        let n = model.dimensions.coordinates();
+        let mut largest = self.push_at_start(model);
+        for g in 0..self.beside.len() {
+            self.move_to(state, increments, width, n, g);
             let orientations =
-                balls.as_mut().map_or(&[][..], |balls| balls.move_to_node(increments, j));
-            self.at[j].evaluate(model, q, orientations);
-            if j < count {
-                self.at[j].differentiate(model, q);
-            }
-        }
-        self.pushes.fill(0.0);
-        let mut largest = 0.0;
-        let nodes = self.pushes.chunks_exact_mut(nd.max(1)).zip(&self.at);
-        for ((pushes, at), multipliers) in nodes.zip(self.multipliers.chunks_exact(d.constraints)) {
-            let sizes = &mut self.moved[..nd];
-            sizes.fill(0.0);
-            for (c, (constraint, lambda)) in model.constraints.iter().zip(multipliers).enumerate() {
-                let row = &at.jacobian[c * n..][..n];
-                for &a in constraint.dynamic_coordinates() {
-                    let push = row[a] * lambda;
-                    pushes[a] -= push;
-                    sizes[a] += push.abs();
-                }
-            }
-            largest = sizes.iter().copied().fold(largest, larger);
+                balls.as_mut().map_or(&[][..], |balls| balls.move_to_nodes(increments, g));
+            let q = &self.q_beside[g * n..][..n];
+            self.beside[g].evaluate(model, q, orientations);
+            self.beside[g].differentiate(model, q);
+            largest = larger(largest, self.push(model, g));
         }
         if let Some(balls) = balls {
-            balls.move_to_node(increments, 0);
-            for (j, pushes) in self.pushes.chunks_exact_mut(nd.max(1)).enumerate() {
-                balls.take_pushes(j, pushes);
+            balls.move_to_start(increments);
+            balls.take_start_pushes(&mut self.start_pushes);
+            let nd = self.start_pushes.len();
+            for (g, pushes) in self.pushes.chunks_exact_mut(nd.max(1)).enumerate() {
+                balls.take_pushes(g, pushes);
             }
         }
         largest
     }
 
+    /// Configurations of `N` nodes.
+    fn move_to(
+        &mut self,
+        state: &PreciseState,
+        increments: &[f64],
+        width: usize,
+        n: usize,
+        g: usize,
+    ) {
+        in_registers!(LanesOf<N>, {
+            let reach = &self.reach_beside[g * self.count..][..self.count];
+            let q = &mut self.q_beside[g * n..];
+            for (a, own) in increments.chunks_exact(width).enumerate() {
+                let mut moved = LanesOf::ZERO;
+                for (kappa, y) in reach.iter().zip(own) {
+                    moved += *kappa * *y;
+                }
+                q[a] = (moved + state.q_low[a]) + state.q[a];
+            }
+        })
+    }
+
+    /// Impulses of the start; returns what they are the sums of, at most.
+    fn push_at_start(&mut self, model: &Model) -> f64 {
+        let n = model.dimensions.coordinates();
+        let sizes = &mut self.moved[..self.start_pushes.len()];
+        sizes.fill(0.0);
+        self.start_pushes.fill(0.0);
+        for (c, constraint) in model.constraints.iter().enumerate() {
+            let (row, lambda) = (&self.start.jacobian[c * n..][..n], self.multipliers[c]);
+            for &a in constraint.dynamic_coordinates() {
+                let push = row[a] * lambda;
+                self.start_pushes[a] -= push;
+                sizes[a] += push.abs();
+            }
+        }
+        sizes.iter().copied().fold(0.0, larger)
+    }
+
+    /// Values and impulses of `N` nodes; returns what impulses are the sums of, at most.
+    fn push(&mut self, model: &Model, g: usize) -> f64 {
+        let (nd, n) = (self.start_pushes.len(), model.dimensions.coordinates());
+        let nc = model.constraints.len();
+        self.take_multipliers(g);
+        in_registers!(LanesOf<N>, {
+            let (at, sizes) = (&self.beside[g], &mut self.sizes[..]);
+            let nodes = self.values[g * N * nc..].chunks_exact_mut(nc);
+            for (lane, values) in nodes.take(N).enumerate() {
+                for (value, several) in values.iter_mut().zip(&at.value) {
+                    *value = several.0[lane];
+                }
+            }
+            let pushes = &mut self.pushes[g * nd..][..nd];
+            pushes.fill(LanesOf::ZERO);
+            sizes.fill(LanesOf::ZERO);
+            let rows = at.jacobian.chunks_exact(n).zip(&self.multipliers_beside);
+            for (constraint, (row, lambda)) in model.constraints.iter().zip(rows) {
+                for &a in constraint.dynamic_coordinates() {
+                    let push = row[a] * *lambda;
+                    pushes[a] -= push;
+                    sizes[a] += push.abs();
+                }
+            }
+            sizes.iter().flat_map(|size| size.0).fold(0.0, larger)
+        })
+    }
+
+    /// The impulses of `N` nodes side by side; what comes after the step has none.
+    fn take_multipliers(&mut self, g: usize) {
+        let nc = self.equations();
+        for (c, lambda) in self.multipliers_beside.iter_mut().enumerate() {
+            *lambda = LanesOf(array::from_fn(|lane| {
+                self.multipliers.get((1 + g * N + lane) * nc + c).copied().unwrap_or_default()
+            }));
+        }
+    }
+
     /// Largest violation in units of its round-off.
     pub(super) fn violation(&self) -> f64 {
-        self.at[1..].iter().map(Closure::violation).fold(0.0, larger)
+        let nc = self.equations();
+        let relative = |c: usize| {
+            let value = self.values[c..].iter().step_by(nc).fold(0.0, |most, h| larger(most, *h));
+            let round_off = self.beside.iter().fold(0.0, |most, at| larger(most, at.round_off[c]));
+            if value == 0.0 { 0.0 } else { value / round_off }
+        };
+        (0..nc).map(relative).fold(0.0, larger)
     }
 
     /// Adds the impulses to the residuals of the stages.
     pub(super) fn add_pushes(&self, residual: &mut [f64]) {
-        let count = self.count;
-        let nd = self.pushes.len() / count;
-        let rows = residual.chunks_exact_mut(count).zip(&self.whole);
-        for (a, (residual, whole)) in rows.enumerate() {
-            for (pushes, reach) in
-                self.pushes.chunks_exact(nd.max(1)).zip(self.reach.chunks_exact(count))
-            {
-                let stages = residual.iter_mut().zip(reach);
-                stages.for_each(|(r, kappa)| *r += (whole - kappa) * pushes[a]);
+        in_registers!(LanesOf<N>, {
+            let (nd, groups) = (self.start_pushes.len(), self.beside.len());
+            for (a, residual) in residual.chunks_exact_mut(self.count).enumerate() {
+                let whole = LanesOf::constant(self.whole[a]);
+                for (to, residual) in residual.chunks_mut(N).enumerate() {
+                    let mut sum = LanesOf::load_some(residual) + whole * self.start_pushes[a];
+                    for g in 0..groups {
+                        let nodes = self.pushes[g * nd + a].0.iter();
+                        let reached = self.stages_reached[(1 + g * N) * groups + to..].iter();
+                        for (kappa, push) in reached.step_by(groups).zip(nodes) {
+                            sum += (whole - *kappa) * *push;
+                        }
+                    }
+                    sum.store_some(residual);
+                }
             }
+        })
+    }
+
+    /// Writes what is known at the nodes one after the other: configurations and Jacobians.
+    pub(crate) fn spread(&mut self) {
+        let n = self.start_q.len();
+        let size = self.start.jacobian.len();
+        self.q[..n].copy_from_slice(&self.start_q);
+        self.jacobians[..size].copy_from_slice(&self.start.jacobian);
+        for j in 1..=self.count {
+            let (g, lane) = ((j - 1) / N, (j - 1) % N);
+            let own = self.q[j * n..][..n].iter_mut().zip(&self.q_beside[g * n..]);
+            own.for_each(|(q, several)| *q = several.0[lane]);
+            let own = self.jacobians[j * size..][..size].iter_mut();
+            own.zip(&self.beside[g].jacobian).for_each(|(entry, all)| *entry = all.0[lane]);
         }
     }
 
-    /// Second derivatives at the last evaluation, of the start too where derivatives by it are asked for, and the
-    /// Jacobian at the end.
+    /// `Dh` at a node.
+    fn jacobian(&self, j: usize) -> &[f64] {
+        let size = self.start.jacobian.len();
+        &self.jacobians[j * size..][..size]
+    }
+
+    /// `out −= Dhᵀ Λ_j` of a node.
+    fn subtract_impulses(&self, j: usize, out: &mut [f64]) {
+        let (n, nc) = (self.start_q.len(), self.equations());
+        let rows = self.jacobian(j).chunks_exact(n).zip(&self.multipliers[j * nc..]);
+        for (row, lambda) in rows {
+            out.iter_mut().zip(row).for_each(|(out, entry)| *out -= entry * lambda);
+        }
+    }
+
+    /// Second derivatives at the last evaluation, of the start too where derivatives by it are asked for.
     pub(crate) fn curve(&mut self, model: &Model, with_start: bool) {
         let n = model.dimensions.coordinates();
-        self.at[self.count].differentiate(model, &self.q[self.count * n..]);
-        let nc = self.equations();
-        for j in usize::from(!with_start)..self.count {
-            let (q, lambda) = (&self.q[j * n..][..n], &self.multipliers[j * nc..][..nc]);
-            self.at[j].hessian(model, q, lambda, &mut self.hessians[j * n * n..][..n * n]);
+        let (nc, size) = (self.equations(), n * n);
+        if with_start {
+            let (q, lambda) = (&self.start_q, &self.multipliers[..nc]);
+            self.start.hessian(model, q, lambda, &mut self.hessians[..size]);
+        }
+        for g in 0..self.beside.len() {
+            self.take_multipliers(g);
+            let Self { q_beside, multipliers_beside, hessian_beside, .. } = self;
+            let q = &q_beside[g * n..][..n];
+            self.beside[g].hessian(model, q, multipliers_beside, hessian_beside);
+            for (lane, out) in
+                self.hessians[size * (1 + g * N)..].chunks_exact_mut(size).take(N).enumerate()
+            {
+                out.iter_mut().zip(&*hessian_beside).for_each(|(to, from)| *to = from.0[lane]);
+            }
         }
     }
 
     /// Hands out what is known of the nodes.
     pub(super) fn place(&self, model: &Model, slopes: &mut Slopes) {
         let (nd, n, count) = (model.dimensions.dynamic, model.dimensions.coordinates(), self.count);
-        let nc = self.equations();
-        for (j, at) in self.at.iter().enumerate() {
-            if let Some(closing) = &mut slopes.closing {
-                closing.jacobians[j * nc * n..][..nc * n].copy_from_slice(&at.jacobian);
-            }
-            if j == count {
-                continue;
-            }
+        if let Some(closing) = &mut slopes.closing {
+            closing.jacobians.copy_from_slice(&self.jacobians);
+        }
+        for j in 0..count {
             let curvature = slopes.second[0][(count + j) * nd * n..].iter_mut();
             curvature.zip(&self.hessian(j)[..nd * n]).for_each(|(to, from)| *to = -from);
             let push = &mut slopes.torque[(count + j) * nd..][..nd];
             push.fill(0.0);
-            at.subtract_impulses(model, &self.multipliers[j * nc..][..nc], push);
+            self.subtract_impulses(j, push);
         }
     }
 
@@ -309,11 +460,13 @@ impl Closures {
         let n = model.dimensions.coordinates();
         let (count, nc, stride) = (self.count, self.equations(), self.stride());
         self.responses.fill(0.0);
-        for (j, at) in self.at[..count].iter().enumerate() {
-            let reach = &self.reach[j * count..][..count];
+        let jacobians = self.jacobians.chunks_exact((nc * n).max(1));
+        for (j, (jacobian, reach)) in
+            jacobians.zip(self.reach.chunks_exact(count)).enumerate().take(count)
+        {
             for (c, constraint) in model.constraints.iter().enumerate() {
                 for &a in constraint.dynamic_coordinates() {
-                    let entry = at.jacobian[c * n + a];
+                    let entry = jacobian[c * n + a];
                     let rows = self.responses[a * count * stride..].chunks_exact_mut(stride);
                     for (row, kappa) in rows.zip(reach) {
                         row[j * nc + c] = (kappa - 1.0) * entry;
@@ -344,7 +497,8 @@ impl Closures {
             return;
         }
         for j in 1..=count {
-            let Self { reach, responses, moved, schur, terms, at, .. } = &mut *self;
+            let Self { reach, responses, moved, schur, terms, jacobians, .. } = &mut *self;
+            let jacobian = &jacobians[j * nc * n..][..nc * n];
             let reach = &reach[j * count..][..count];
             moved.fill(0.0);
             for (a, moved) in moved.chunks_exact_mut(stride).enumerate() {
@@ -356,7 +510,7 @@ impl Closures {
             for ((c, constraint), row) in model.constraints.iter().enumerate().zip(rows) {
                 row.fill(0.0);
                 for &a in constraint.dynamic_coordinates() {
-                    let entry = at[j].jacobian[c * n + a];
+                    let entry = jacobian[c * n + a];
                     let moved = &moved[a * stride..];
                     row.iter_mut().zip(moved).for_each(|(s, x)| *s += entry * x);
                 }
@@ -374,11 +528,12 @@ impl Closures {
             for (moved, x) in self.moved.iter_mut().zip(x.chunks_exact(count)) {
                 *moved = x.iter().zip(reach).map(|(x, kappa)| x * kappa).sum();
             }
-            let at = &self.at[j];
+            let jacobian = &self.jacobians[j * nc * n..][..nc * n];
             for (c, constraint) in model.constraints.iter().enumerate() {
                 let dynamic = constraint.dynamic_coordinates().iter();
-                let along: f64 = dynamic.map(|&a| at.jacobian[c * n + a] * self.moved[a]).sum();
-                self.correction[(j - 1) * nc + c] = along - at.value[c];
+                let along: f64 = dynamic.map(|&a| jacobian[c * n + a] * self.moved[a]).sum();
+                let own = (j - 1) * nc + c;
+                self.correction[own] = along - self.values[own];
             }
         }
         self.schur.solve(&mut self.correction);
@@ -464,14 +619,14 @@ impl Closures {
     ) {
         let &Parameters { nc, stride, .. } = theta;
         let (n, count) = (theta.n(), self.count);
-        let Self { reach, nodes, at, terms, .. } = self;
+        let Self { reach, nodes, jacobians, terms, .. } = self;
         multipliers.fill(0.0);
         for (row, (j, c)) in multipliers
             .chunks_exact_mut(stride)
             .zip((1..=count).flat_map(|j| (0..nc).map(move |c| (j, c))))
         {
             let reach = &reach[j * count..][..count];
-            let jacobian = &at[j].jacobian[c * n..][..n];
+            let jacobian = &jacobians[(j * nc + c) * n..][..n];
             for (b, entry) in jacobian.iter().enumerate() {
                 for (column, part) in theta.moves(b, nodes[j]) {
                     row[column] += part * entry;
@@ -511,14 +666,15 @@ impl Closures {
         [impulse, multipliers]: [&mut [f64]; 2],
     ) {
         let nc = self.equations();
+        self.spread();
         multipliers.fill(0.0);
         impulse.iter_mut().zip(&self.turned).for_each(|(sum, turned)| *sum += turned);
         for j in 0..self.count {
             if redundant > 0 {
                 self.remove_null(model, j);
             }
+            self.subtract_impulses(j, impulse);
             let own = &self.multipliers[j * nc..][..nc];
-            self.at[j].subtract_impulses(model, own, impulse);
             multipliers.iter_mut().zip(own).for_each(|(sum, lambda)| *sum += lambda);
         }
     }
@@ -526,7 +682,7 @@ impl Closures {
     /// Takes from the multipliers of a node what exerts no force.
     fn remove_null(&mut self, model: &Model, j: usize) {
         let (n, nc) = (model.dimensions.coordinates(), self.equations());
-        let jacobian = &self.at[j].jacobian;
+        let jacobian = &self.jacobians[j * nc * n..][..nc * n];
         for (c, row) in self.gram.matrix.chunks_exact_mut(nc).enumerate() {
             for (other, entry) in row.iter_mut().enumerate() {
                 let dynamic = model.constraints[c].dynamic_coordinates().iter();

@@ -113,11 +113,11 @@ impl Middle {
     }
 
     /// Corrects increments and impulses, from the residuals of the stages and the violations at the nodes.
-    pub(super) fn correct(
+    pub(super) fn correct<const N: usize>(
         &mut self,
         workspace: &mut Workspace,
         model: &Model,
-        closures: &mut Closures,
+        closures: &mut Closures<N>,
         residual: &[f64],
         is_first: bool,
     ) -> &[f64] {
@@ -134,8 +134,8 @@ impl Middle {
             }
             let row = &inverse[i * count..][..count];
             for (c, r) in constraints.iter_mut().enumerate() {
-                let nodes = row.iter().zip(&closures.at[1..]);
-                *r = nodes.map(|(part, at)| part * at.value[c]).sum();
+                let nodes = row.iter().zip(closures.values.chunks_exact(nc));
+                *r = nodes.map(|(part, values)| part * values[c]).sum();
             }
             workspace.kkt.solve(model, &workspace.constraints.end, dynamics, constraints);
             for (own, x) in increments.chunks_exact_mut(count).zip(&*dynamics) {

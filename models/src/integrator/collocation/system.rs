@@ -85,7 +85,7 @@ pub(crate) struct System<const N: usize> {
     l_q: Vec<LanesOf<N>>,
     l_v: Vec<LanesOf<N>>,
     pub(crate) balls: Option<Box<Balls<N>>>,
-    pub(crate) closures: Option<Box<Closures>>,
+    pub(crate) closures: Option<Box<Closures<N>>>,
     /// `L_q + f` of each `N` stages, with ball joints.
     force: Vec<LanesOf<N>>,
     alike: Option<Alike<N>>,
@@ -546,6 +546,7 @@ impl<const N: usize> System<N> {
             if fresh {
                 self.differentiate(workspace, at, inputs);
                 if let Some(closures) = &mut self.closures {
+                    closures.spread();
                     closures.curve(model, false);
                 }
                 self.fill_matrix(at);
