@@ -166,14 +166,14 @@ impl<const N: usize> System<N> {
         tableau: &Tableau,
         [inputs, motion]: [&mut [f64]; 2],
     ) -> Result<StepReport, StepError> {
-        self.begin(at, motion, inputs, &mut workspace.mid.input_force);
+        self.begin(at, motion, inputs, &mut workspace.mid);
         let has_both = self.balls.is_some() && self.closures.is_some();
         let mut report = match self.correct_alike(workspace, at, inputs) {
             Some(Ok(report)) => report,
             Some(Err(error)) if has_both => return Err(explain(workspace, at, error)),
             _ => {
                 self.make_dense(at.model, tableau);
-                self.begin(at, motion, inputs, &mut workspace.mid.input_force);
+                self.begin(at, motion, inputs, &mut workspace.mid);
                 let corrected = self.correct(workspace, at, inputs);
                 corrected.map_err(|error| explain(workspace, at, error))?
             }

@@ -89,10 +89,8 @@ impl Model {
             Reached::Violated => {
                 let relative = |c: usize| (closure.value[c] / closure.round_off[c]).abs();
                 let names = self.constraint_names.iter().enumerate();
-                let constraints = names
-                    .filter(|(c, _)| relative(*c) > enough)
-                    .map(|(_, n)| n.clone())
-                    .collect();
+                let constraints =
+                    names.filter(|(c, _)| relative(*c) > enough).map(|(_, n)| n.clone()).collect();
                 let violation = closure.value.iter().fold(0.0_f64, |a, v| a.max(v.abs()));
                 StepError::InconsistentConstraints { constraints, violation }
             }

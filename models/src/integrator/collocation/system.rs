@@ -17,6 +17,7 @@ use crate::integrator::collocation::hessian::Hessian;
 use crate::integrator::collocation::masses::Masses;
 use crate::integrator::collocation::middle::Middle;
 use crate::integrator::collocation::slopes::Slopes;
+use crate::integrator::midpoint::Midpoint;
 use crate::integrator::newton::{CHORD_FLOOR, FLOOR, STALE};
 use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::scheme::Tableau;
@@ -71,6 +72,10 @@ pub(crate) struct System<const N: usize> {
     columns: Vec<LanesOf<N>>,
     weights: Vec<f64>,
     nodes: Vec<f64>,
+    /// The dynamic coordinates that are none of ball joints; and where they start, without whole turns, and what that
+    /// has lost.
+    plain: Vec<usize>,
+    start: Vec<[f64; 2]>,
     /// Lengths of the stages `h b_i`, and their inverses.
     lengths: Vec<f64>,
     rates: Vec<f64>,
@@ -119,6 +124,8 @@ impl<const N: usize> System<N> {
         let entries = (0..width).flat_map(|i| (0..width).step_by(N).map(move |j| (i, j)));
         let rows = entries.clone().map(|(i, j)| several(&|lane| coupling(i, j + lane))).collect();
         let columns = entries.map(|(j, i)| several(&|lane| coupling(i + lane, j))).collect();
+        let is_ball = |a: &usize| model.orientations.iter().any(|c| (*c..c + 3).contains(a));
+        let plain: Vec<usize> = (0..d.dynamic).filter(|a| !is_ball(a)).collect();
         let zeros = || vec![0.0; d.dynamic * width];
         let lanes = |count: usize| vec![LanesOf::ZERO; count];
         Self {
@@ -129,6 +136,8 @@ impl<const N: usize> System<N> {
             columns,
             weights: padded(&tableau.weights),
             nodes: padded(&tableau.nodes),
+            start: vec![[0.0; 2]; plain.len()],
+            plain,
             lengths: vec![0.0; width],
             rates: vec![0.0; width],
             increment: zeros(),
@@ -214,7 +223,7 @@ impl<const N: usize> System<N> {
         at: StepContext<'_>,
         motion: &[f64],
         inputs: &[f64],
-        force: &mut [f64],
+        Midpoint { turns_per_radian, input_force: force, .. }: &mut Midpoint,
     ) {
         let StepContext { model, settings, state, u } = at;
         let (d, h) = (model.dimensions, settings.time_step_s);
@@ -233,6 +242,9 @@ impl<const N: usize> System<N> {
                     self.held[a * width + i] = *force;
                 }
             }
+        }
+        for (start, &a) in self.start.iter_mut().zip(&self.plain) {
+            *start = without_turns(state.q[a], turns_per_radian[a]);
         }
         if let Some(balls) = &mut self.balls {
             balls.begin(state, &mut self.increment);
@@ -265,7 +277,7 @@ impl<const N: usize> System<N> {
             balls.turn(&self.increment);
         }
         for g in 0..self.groups() {
-            self.move_to(state, &workspace.mid.turns_per_radian, n, g);
+            self.move_to(state, n, g);
             let first = g * N;
             if let Some(balls) = &mut self.balls {
                 let place = [&mut self.q[g * n..][..n], &mut self.velocity[g * n..][..n]];
@@ -296,18 +308,16 @@ impl<const N: usize> System<N> {
         magnitude
     }
 
-    /// Configurations and velocities of `N` stages.
-    pub(crate) fn move_to(&mut self, state: &PreciseState, per_radian: &[f64], n: usize, g: usize) {
+    /// Configurations and velocities of `N` stages, but of ball joints.
+    pub(crate) fn move_to(&mut self, state: &PreciseState, n: usize, g: usize) {
         in_registers!(LanesOf<N>, {
-            let first = g * N;
+            let (first, groups) = (g * N, self.groups());
             let rates = LanesOf::load(&self.rates[first..]);
-            for (a, per_radian) in per_radian.iter().enumerate() {
+            for (&a, [angle, rest]) in self.plain.iter().zip(&self.start) {
                 let own = &self.increment[a * self.width..][..self.width];
-                let groups = self.groups();
                 let more =
                     Self::coupled(&self.columns, groups, g, &own[..self.count]) + state.q_low[a];
-                let [angle, rest] = without_turns(state.q[a], *per_radian);
-                self.q[g * n + a] = more + rest + angle;
+                self.q[g * n + a] = more + *rest + *angle;
                 self.velocity[g * n + a] = LanesOf::load(&own[first..]) * rates;
             }
         })
@@ -368,11 +378,12 @@ impl<const N: usize> System<N> {
         [residual, violation]
     }
 
-    /// The residuals, as if there were neither ball joints nor constraints.
+    /// The residuals but of ball joints, as if there were no constraints.
     fn find_linear_residuals(&mut self, state: &PreciseState) -> f64 {
         in_registers!(LanesOf<N>, {
             let (groups, mut sizes) = (self.groups(), [0.0; N]);
-            for (a, residual) in self.residual.chunks_exact_mut(self.count).enumerate() {
+            for &a in &self.plain {
+                let residual = &mut self.residual[a * self.count..][..self.count];
                 let own = &self.impulse[a * self.width..][..self.width];
                 for (g, residual) in residual.chunks_mut(N).enumerate() {
                     let first = g * N;
