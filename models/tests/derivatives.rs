@@ -3,7 +3,9 @@
 use crate::common::linearization::{check, check_with, check_within};
 use plantd_models::Model;
 
-use crate::common::{MOVED_BALL, PUSHES, builtin, floating, methods, pulled_rope, random_tree};
+use crate::common::{
+    ACROSS, MOVED_BALL, PUSHES, builtin, floating, methods, pulled_rope, random_tree,
+};
 
 #[test]
 fn unconstrained_builtin_scenes() {
@@ -37,10 +39,11 @@ fn random_trees() {
     }
 }
 
-/// What acts from the world on bodies of a long chain, with equal halves of forces and with those of the paper.
+/// What acts from the world on bodies of a long chain and across its joints, with equal halves of forces and with those
+/// of the paper.
 #[test]
 fn ropes_that_are_pulled_from_the_world() {
-    for more in ["", PUSHES, MOVED_BALL] {
+    for more in ["", PUSHES, MOVED_BALL, ACROSS] {
         let scene = pulled_rope(more);
         let plan = Model::compile(&scene).unwrap().plan();
         assert!(plan.contains("by generators, with what acts from the world"), "{plan}");

@@ -16,7 +16,7 @@ use crate::compile::{inertia, pattern, settling};
 use crate::model::conditioning::Conditioning;
 use crate::model::mechanism::{
     Alignment, AlongAxis, Armature, Carries, Constraint, ConstraintKind, Coordinate, Coupling,
-    Dimensions, Forces, Length, Model, OperatingPoint, PathJoint, PathLength, PointDistance,
+    Dimensions, Forces, Length, Model, Mover, OperatingPoint, PathJoint, PathLength, PointDistance,
     PointPair, Polynomial, Product, Solver, Vector,
 };
 use crate::model::planar_tree::{crooked, planar};
@@ -538,7 +538,17 @@ impl Places<'_> {
     pub(crate) fn between(&self, a: Attachment, b: Attachment) -> PointPair {
         let mut pair = self.between_in_world(a, b);
         pair.path.retain(|joint| joint.carries != Carries::Both);
+        pair.mover = self.mover(&pair.path);
         pair
+    }
+
+    fn mover(&self, path: &[PathJoint]) -> Option<Mover> {
+        let joint = &self.tree.joints[path.first()?.joint];
+        let (mover, axes) = match joint.kind {
+            JointKind::Ball(_) => (Mover::Ball(joint.orientation), 3),
+            _ => (Mover::Axis(joint.coordinate), 1),
+        };
+        (path.len() == axes).then_some(mover)
     }
 
     /// Two points; joints that carry both drop out if they do not turn.
@@ -558,7 +568,7 @@ impl Places<'_> {
             .chain(path_a[common..].iter().map(entry(Carries::A)))
             .chain(path_b[common..].iter().map(entry(Carries::B)))
             .collect();
-        PointPair { a, b, path }
+        PointPair { a, b, path, mover: None }
     }
 
     /// The segments of a path from point to point.

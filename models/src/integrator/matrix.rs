@@ -95,8 +95,8 @@ impl Workspace {
     /// What recursions need of coordinates at the last evaluation, beside the bodies.
     pub(crate) fn weigh_coordinates(&mut self, model: &Model, settings: &Settings) {
         self.mid.fill_diagonal(model, settings, &mut self.kkt.diagonal);
+        let weight = 2.0 * settings.force_split.at_start();
         if let Some(fields) = self.kkt.fields.as_deref_mut() {
-            let weight = 2.0 * settings.force_split.at_start();
             fields.evaluate(model, &self.mid.instant(model), weight);
         }
         if !model.orientations.is_empty() {
@@ -105,7 +105,7 @@ impl Workspace {
             let weights = &mut kkt.balls;
             mid.for_each_own_torque(
                 model,
-                kkt.fields.as_deref(),
+                (kkt.fields.as_deref(), weight),
                 |o, OwnTorque { by_turn, by_velocity }| {
                     let Weights { torque, column, own, .. } = &mut weights[o];
                     let turned = by_turn.times(column).scaled(0.25 * h);

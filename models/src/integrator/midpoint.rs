@@ -14,9 +14,8 @@ use crate::lagrangian::fields::{Fields, OwnTorque};
 use crate::lagrangian::instant::Instant;
 use crate::lagrangian::kinematics::Place;
 use crate::lagrangian::mechanics::Mechanics;
-use crate::lagrangian::potentials::Potential as _;
 use crate::lagrangian::{armature, forces};
-use crate::model::mechanism::{Model, Spring};
+use crate::model::mechanism::{Model, Mover, Spring};
 use crate::model::tree::JointKind;
 
 /// The midpoint of an increment `x`: `q0 + ½x`, `x/h` with `1/h` given, and the first without whole turns.
@@ -28,24 +27,38 @@ pub(crate) fn middle<S: Side>(x: S, q: S, q_low: S, per_radian: S, inverse: f64)
 
 impl Midpoint {
     /// Calls `take(orientation, torque)` for what depends on the turn and the velocity of one dynamic ball joint, beside
-    /// the bodies: its springs, and what acts on bodies from the world. It may come more than once, and adds up.
+    /// the bodies: what acts across it, where forces count `weight` times, and what acts on bodies from the world. It
+    /// may come more than once, and adds up.
     pub(crate) fn for_each_own_torque(
         &self,
         model: &Model,
-        fields: Option<&Fields>,
+        (fields, weight): (Option<&Fields>, f64),
         mut take: impl FnMut(usize, &OwnTorque),
     ) {
         let Mechanics { poses, momenta, .. } = &self.mechanics;
         let (joints, at) =
             (&model.dynamics.joints, Place { tree: &model.dynamics, poses, q: &self.q });
         for spring in &model.potentials.springs {
-            if let Spring::Orientation(spring) = spring {
-                let (mut own, first) = (OwnTorque::NONE, spring.coordinate);
-                spring.for_each_second_derivative(at, &mut |i, j, value| {
-                    own.by_turn.0[j - first].0[i - first] -= value;
-                });
-                take(joints[spring.joint].orientation, &own);
-            }
+            let orientation = match (spring, spring.mover()) {
+                (Spring::Orientation(spring), _) => joints[spring.joint].orientation,
+                (_, Some(Mover::Ball(orientation))) => orientation,
+                _ => continue,
+            };
+            let (mut own, first) = (OwnTorque::NONE, model.orientations[orientation]);
+            spring.for_each_second_derivative(at, |i, j, value| {
+                own.by_turn.0[j - first].0[i - first] -= value;
+            });
+            take(orientation, &own);
+        }
+        if let Some(forces) = model.forces.as_ref().filter(|forces| forces.cross_balls()) {
+            forces.for_each_derivative_across(&self.instant(model), |mover, i, j, by_q, by_v| {
+                if let Mover::Ball(orientation) = mover {
+                    let (mut own, first) = (OwnTorque::NONE, model.orientations[orientation]);
+                    own.by_turn.0[j - first].0[i - first] = weight * by_q;
+                    own.by_velocity.0[j - first].0[i - first] = weight * by_v;
+                    take(orientation, &own);
+                }
+            });
         }
         let Some(fields) = fields else { return };
         for (first, joint) in joints.iter().enumerate() {

@@ -26,7 +26,7 @@ use plantd_math::spatial::{Force, Mat3, Motion, Vec3};
 
 use crate::lagrangian::instant::Instant;
 use crate::lagrangian::momenta::Momenta;
-use crate::model::mechanism::{Forces, Model, PointForce, Potentials, Spring};
+use crate::model::mechanism::{Forces, Model, Potentials, Spring, mover};
 use crate::model::tree::{Tree, WORLD};
 
 /// Takes a wrench, and its change with the motion of the body `(J, J̇)`.
@@ -129,8 +129,8 @@ impl OwnTorque {
 }
 
 impl Model {
-    /// What acts on bodies from the world, at their poses, where nothing acts between bodies; and what each counts,
-    /// where forces count `weight` times.
+    /// What acts on bodies from the world, at their poses, but what acts across one joint; and what each counts, where
+    /// forces count `weight` times.
     fn fields(&self, weight: f64) -> impl Iterator<Item = (&dyn Field, f64)> {
         let springs = self.potentials.fields().map(|field| (field, 1.0));
         springs.chain(self.forces.iter().flat_map(Forces::fields).map(move |field| (field, weight)))
@@ -145,7 +145,7 @@ impl Model {
 impl Potentials {
     fn fields(&self) -> impl Iterator<Item = &dyn Field> {
         self.springs.iter().filter_map(|spring| match spring {
-            Spring::Point(spring) => Some(spring as &dyn Field),
+            Spring::Point(spring) if spring.ends.mover.is_none() => Some(spring as &dyn Field),
             _ => None,
         })
     }
@@ -154,16 +154,16 @@ impl Potentials {
 impl Forces {
     fn fields(&self) -> impl Iterator<Item = &dyn Field> {
         let wrenches = self.wrenches.iter().map(|wrench| wrench as &dyn Field);
-        wrenches.chain(self.point_forces.iter().map(|force| force as &dyn Field))
+        let at_points = self.point_forces.iter().filter(|force| force.ends.mover.is_none());
+        wrenches.chain(at_points.map(|force| force as &dyn Field))
     }
 
-    /// Whether some act at poses, and none couple bodies or coordinates.
-    pub(crate) fn are_fields(&self) -> bool {
+    /// Whether all act on bodies from the world or on one joint, and none couple more.
+    pub(crate) fn are_generated(&self) -> bool {
         let Self { linear_dampers, path_forces, point_forces, .. } = self;
-        let is_from_world = |force: &PointForce| force.ends.moving_end().is_some();
         linear_dampers.is_empty()
-            && path_forces.is_empty()
-            && point_forces.iter().all(is_from_world)
+            && path_forces.iter().all(|force| mover(&force.segments).is_some())
+            && point_forces.iter().all(|force| force.ends.is_moved_alone())
     }
 }
 

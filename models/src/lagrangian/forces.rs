@@ -14,7 +14,7 @@ pub(crate) mod wrench;
 use plantd_math::scalar::Scalar;
 
 use crate::lagrangian::instant::Instant;
-use crate::model::mechanism::{CoordinateInput, Forces};
+use crate::model::mechanism::{CoordinateInput, Forces, Mover, mover};
 
 /// Writes the input forces of a step; they do not change within it.
 #[inline(never)]
@@ -98,7 +98,8 @@ impl Forces {
         for_each_force!(self, element => element.add(at, force));
     }
 
-    /// Calls `entry(i, ∂f_i/∂q_i, ∂f_i/∂v_i)` for the forces on single coordinates.
+    /// Calls `entry(i, ∂f_i/∂q_i, ∂f_i/∂v_i)` for the forces on single coordinates, and those across one joint that is
+    /// no ball joint.
     pub(crate) fn for_each_own_derivative<S: Scalar>(
         &self,
         at: &Instant<'_, S>,
@@ -107,6 +108,36 @@ impl Forces {
         for force in &self.coordinate_forces {
             force.for_each_derivative(at, &mut |i, _, by_q, by_v| entry(i, by_q, by_v));
         }
+        self.for_each_derivative_across(at, |mover, i, _, by_q, by_v| {
+            if let Mover::Axis(_) = mover {
+                entry(i, by_q, by_v);
+            }
+        });
+    }
+
+    /// Calls `entry(joint, i, j, ∂f_i/∂q_j, ∂f_i/∂v_j)` for the forces between points that one joint alone moves.
+    pub(crate) fn for_each_derivative_across<S: Scalar>(
+        &self,
+        at: &Instant<'_, S>,
+        mut entry: impl FnMut(Mover, usize, usize, S, S),
+    ) {
+        for force in &self.point_forces {
+            if let Some(joint) = force.ends.mover {
+                force.for_each_derivative(at, &mut |i, j, q, v| entry(joint, i, j, q, v));
+            }
+        }
+        for force in &self.path_forces {
+            if let Some(joint) = mover(&force.segments) {
+                force.for_each_derivative(at, &mut |i, j, q, v| entry(joint, i, j, q, v));
+            }
+        }
+    }
+
+    /// Whether some act across one ball joint.
+    pub(crate) fn cross_balls(&self) -> bool {
+        let points = self.point_forces.iter().map(|force| force.ends.mover);
+        let paths = self.path_forces.iter().map(|force| mover(&force.segments));
+        points.chain(paths).any(|mover| matches!(mover, Some(Mover::Ball(_))))
     }
 
     /// [`GeneralizedForce::for_each_derivative`] of each force.

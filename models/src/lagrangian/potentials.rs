@@ -15,7 +15,7 @@ pub(crate) mod spline_spring;
 use plantd_math::scalar::Scalar;
 
 use crate::lagrangian::kinematics::{Place, Poses};
-use crate::model::mechanism::{Model, Spring};
+use crate::model::mechanism::{Model, Mover, Spring};
 
 /// A potential `V(q)`.
 pub(crate) trait Potential {
@@ -70,6 +70,15 @@ impl Spring {
     pub(crate) fn couples(&self) -> Vec<usize> {
         of_each_kind!(self, spring => spring.couples())
     }
+
+    /// [`Potential::for_each_second_derivative`].
+    pub(crate) fn for_each_second_derivative<S: Scalar>(
+        &self,
+        at: Place<'_, S>,
+        mut entry: impl FnMut(usize, usize, S),
+    ) {
+        of_each_kind!(self, spring => spring.for_each_second_derivative(at, &mut entry));
+    }
 }
 
 impl Model {
@@ -89,7 +98,7 @@ impl Model {
         self.potentials.springs.iter().fold(S::ZERO, |sum, spring| sum + energy(spring))
     }
 
-    /// Calls `entry(i, V_ii)` for the springs of single coordinates.
+    /// Calls `entry(i, V_ii)` for the springs of single coordinates, and those across one joint that is no ball joint.
     pub(crate) fn for_each_own_spring_derivative<S: Scalar>(
         &self,
         poses: &Poses<S>,
@@ -100,7 +109,12 @@ impl Model {
         let mut take = |i: usize, _: usize, value: S| entry(i, value);
         for spring in &self.potentials.springs {
             match spring {
-                Spring::Point(_) | Spring::Path(_) | Spring::Orientation(_) => {}
+                Spring::Point(_) | Spring::Path(_) => {
+                    if let Some(Mover::Axis(_)) = spring.mover() {
+                        spring.for_each_second_derivative(at, &mut take);
+                    }
+                }
+                Spring::Orientation(_) => {}
                 Spring::Coordinate(own) => own.for_each_second_derivative(at, &mut take),
                 Spring::Spline(own) => own.for_each_second_derivative(at, &mut take),
                 Spring::Linear(own) => own.for_each_second_derivative(at, &mut take),
@@ -118,7 +132,7 @@ impl Model {
     ) {
         let at = Place { tree: &self.dynamics, poses, q };
         for spring in &self.potentials.springs {
-            of_each_kind!(spring, spring => spring.for_each_second_derivative(at, &mut entry));
+            spring.for_each_second_derivative(at, &mut entry);
         }
     }
 }

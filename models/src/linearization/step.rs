@@ -132,7 +132,8 @@ impl Workspace {
         } else {
             self.find_turnings(at, ends);
             let Self { mid, kkt, tangents, .. } = self;
-            mid.for_each_own_torque(model, kkt.fields.as_deref(), |o, own| {
+            // Forces have equal halves: see [`takes_split`].
+            mid.for_each_own_torque(model, (kkt.fields.as_deref(), 1.0), |o, own| {
                 tangents.balls[o].add_torque(&ends.turnings[o], own, ends.time_step_s);
             });
             self.fill_turned_inputs(model, ends);
@@ -479,8 +480,8 @@ impl Workspace {
 
 /// Whether generators have what forces at poses give to derivatives: they are those of equal halves.
 pub(crate) fn takes_split(model: &Model, settings: &Settings) -> bool {
-    let is_split = settings.force_split == ForceSplit::Paper && model.forces.is_some();
-    !(is_split && model.has_fields())
+    settings.force_split == ForceSplit::Symmetric
+        || model.forces.as_ref().is_none_or(|forces| !forces.cross_balls() && !model.has_fields())
 }
 
 /// Impulses of inputs of coordinates.

@@ -197,13 +197,22 @@ impl Spring {
 }
 
 impl Spring {
-    /// Whether it acts on one coordinate, on one ball joint, or on a body from the world.
+    /// Whether it acts on one coordinate, on one joint, or on a body from the world.
     fn is_generated(&self) -> bool {
         match self {
             Self::Coordinate(_) | Self::Spline(_) | Self::Stop(_) | Self::Orientation(_) => true,
-            Self::Point(spring) => spring.ends.moving_end().is_some(),
+            Self::Point(spring) => spring.ends.is_moved_alone(),
             Self::Linear(_) => !self.couples_branches(),
-            Self::Path(_) => false,
+            Self::Path(spring) => mover(&spring.segments).is_some(),
+        }
+    }
+
+    /// The one joint that it acts on, as something between points.
+    pub(crate) fn mover(&self) -> Option<Mover> {
+        match self {
+            Self::Point(spring) => spring.ends.mover,
+            Self::Path(spring) => mover(&spring.segments),
+            _ => None,
         }
     }
 }
@@ -443,6 +452,22 @@ pub(crate) enum LinearLaw {
     Friction { force: f64, velocity: f64 },
 }
 
+/// The one joint that moves points against each other, where no other does.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Mover {
+    /// A hinge, a slide or a screw, by its coordinate.
+    Axis(usize),
+    /// A ball joint, by its orientation.
+    Ball(usize),
+}
+
+/// The one that moves all points of a path.
+pub(crate) fn mover(segments: &[PointPair]) -> Option<Mover> {
+    let mut movers = segments.iter().filter(|ends| !ends.path.is_empty()).map(|ends| ends.mover);
+    let first = movers.next()??;
+    movers.all(|mover| mover == Some(first)).then_some(first)
+}
+
 /// Two points and the joints that move one against the other.
 #[derive(Clone, Debug)]
 pub(crate) struct PointPair {
@@ -452,9 +477,16 @@ pub(crate) struct PointPair {
     /// points change neither their distance nor what else turns with both bodies, and drop out; but
     /// where a world axis is involved, those of them that turn come first.
     pub(crate) path: Vec<PathJoint>,
+    /// The joint on the path, where there is one alone.
+    pub(crate) mover: Option<Mover>,
 }
 
 impl PointPair {
+    /// Whether one joint alone moves the points against each other, or one of them is fixed to the world.
+    pub(crate) fn is_moved_alone(&self) -> bool {
+        self.mover.is_some() || self.moving_end().is_some()
+    }
+
     /// The end on a body, where the other one is fixed to the world.
     pub(crate) fn moving_end(&self) -> Option<(&Attachment, Carries)> {
         match [self.a.joint, self.b.joint] {
@@ -653,12 +685,12 @@ impl Model {
         self.planar.is_none() && self.is_generated()
     }
 
-    /// Whether vectors of the joints generate the whole Newton matrix: without constraints, and what acts between two
-    /// bodies or couples coordinates.
+    /// Whether vectors of the joints generate the whole Newton matrix: without constraints, and what acts between
+    /// bodies with more than one joint between them, or couples coordinates.
     pub(crate) fn is_generated(&self) -> bool {
         let d = self.dimensions;
         let are_generated =
-            |forces: &Forces| forces.are_fields() && !forces.act_on_balls(&self.orientations);
+            |forces: &Forces| forces.are_generated() && !forces.act_on_balls(&self.orientations);
         d.constraints == 0
             && self.forces.as_ref().is_none_or(are_generated)
             && self.potentials.springs.iter().all(Spring::is_generated)

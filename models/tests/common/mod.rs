@@ -361,6 +361,37 @@ name = "f14_rz"
 kind = "prescribed"
 "#;
 
+/// Springs, dampers and a tendon across one hinge and across one ball joint.
+pub(crate) const ACROSS: &str = r#"
+[[inputs]]
+name = "tendon"
+points = [{ frame = "f2", at = [0.1, 0.05, -0.2] }, { frame = "f2", at = [0.1, 0.0, -0.3] }, { frame = "f3", at = [0.05, 0.1, -0.1] }]
+gain = 1.5
+[[inputs]]
+name = "muscle"
+points = [{ frame = "f7", at = [0.1, 0.05, -0.2] }, { frame = "f8", at = [0.05, 0.1, -0.1] }]
+[[springs]]
+type = "two_point"
+a = { frame = "f10", at = [0.1, 0.05, -0.2] }
+b = { frame = "f9", at = [0.05, 0.1, -0.1] }
+stiffness = 30.0
+rest_length = 0.1
+[[springs]]
+type = "path"
+points = [{ frame = "f13", at = [0.1, 0.05, -0.2] }, { frame = "f14", at = [0.05, 0.1, -0.1] }]
+stiffness = 20.0
+rest_length = 0.15
+[[forces]]
+type = "path_damper"
+points = [{ frame = "f10", at = [0.1, 0.05, -0.2] }, { frame = "f11", at = [0.05, 0.1, -0.1] }]
+damping = 0.7
+[[forces]]
+type = "two_point_damper"
+a = { frame = "f8", at = [0.1, 0.05, -0.2] }
+b = { frame = "f7", at = [0.05, 0.1, -0.1] }
+damping = 0.6
+"#;
+
 /// A body that floats freely, with two arms; no gravity.
 pub(crate) fn floating() -> Scene {
     Scene::from_toml(FLOATING).unwrap()

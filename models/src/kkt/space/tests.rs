@@ -475,6 +475,70 @@ fn what_acts_from_the_world_is_generated() {
     }
 }
 
+/// Springs, dampers and a tendon between points of bodies.
+fn between(bodies: &[[&str; 2]]) -> String {
+    let mut text = String::new();
+    for (k, [a, b]) in bodies.iter().enumerate() {
+        let first = format!("{{ frame = \"{a}\", at = [0.2, 0.1, -0.3] }}");
+        let last = format!("{{ frame = \"{b}\", at = [-0.1, 0.3, 0.2] }}");
+        let points =
+            format!("points = [{first}, {{ frame = \"{a}\", at = [0.1, -0.2, 0.1] }}, {last}]");
+        for element in [
+            format!(
+                "[[springs]]\ntype = \"two_point\"\na = {first}\nb = {last}\nstiffness = 20.0\nrest_length = 0.4"
+            ),
+            format!("[[springs]]\ntype = \"path\"\n{points}\nstiffness = 9.0\nrest_length = 0.3"),
+            format!(
+                "[[forces]]\ntype = \"two_point_damper\"\na = {last}\nb = {first}\ndamping = 0.8"
+            ),
+            format!("[[forces]]\ntype = \"path_damper\"\n{points}\ndamping = 0.5"),
+            format!("[[inputs]]\nname = \"tendon{k}\"\n{points}\ngain = 1.5"),
+        ] {
+            text += &(element + "\n");
+        }
+    }
+    text
+}
+
+/// What acts across one joint is its own, a ball joint or not.
+#[test]
+fn what_acts_across_a_joint_is_generated() {
+    let tree = "gravity = [1.0, -2.0, -9.0]\ntime_step_s = 0.002";
+    let hull = [["f0", "hull"], ["f1", "f4"], ["f5", "f2"], ["f4", "f7"], ["f1", "hull"]];
+    let rope_of_32 = compiled(&rope(32, &between(&[["f3", "f4"], ["f5", "f4"], ["world", "f0"]])));
+    assert_eq!(rope_of_32.solver, Solver::Spatial);
+    let of_floating = |moved: &[&str]| {
+        let text = floating().scene().to_toml() + &between(&hull);
+        let mut scene = Scene::from_toml(&text).unwrap();
+        prescribe(&mut scene, moved);
+        Model::compile(&scene).unwrap()
+    };
+    let branches = branching(24, &(tree.to_owned() + "\n"), "").scene().to_toml();
+    let parents: Vec<[String; 2]> = {
+        let scene = Scene::from_toml(&branches).unwrap();
+        let frames = scene.frames.iter().skip(3).step_by(4);
+        frames.map(|frame| [frame.name.clone(), frame.parent.clone()]).collect()
+    };
+    let pairs: Vec<[&str; 2]> = parents.iter().map(|p| p.each_ref().map(|n| n.as_str())).collect();
+    for (steps, model) in [
+        (5, rope_of_32),
+        (50, of_floating(&[])),
+        (50, of_floating(&["f3"])),
+        (50, compiled(&(branches + &between(&pairs)))),
+    ] {
+        let model = Arc::new(model);
+        assert!(!model.has_fields());
+        let mut fast = move_alike(&model, steps);
+        let (workspace, settings) = (&mut fast.workspace, &fast.settings);
+        workspace.fill_newton_matrix(&model, settings);
+        let matrix = dense(&model, &workspace.kkt.factored.tree);
+        assert!(workspace.factor_recursion(&model, settings).unwrap());
+        assert_solves(workspace, &model, &matrix);
+    }
+    let far = between(&[["f3", "f9"]]);
+    assert_eq!(compiled(&rope(32, &far)).solver, Solver::Tree);
+}
+
 /// Steps and linearizations in all registers that the processor has, from the same start: few joints and many, hinges
 /// and ball joints, entry by entry and by generators.
 #[test]
