@@ -68,7 +68,7 @@ impl<const N: usize> System<N> {
         self.evaluate(workspace, at, inputs);
         self.differentiate(workspace, at, inputs);
         for i in 0..count {
-            self.place(workspace, at.state, i);
+            self.place(workspace, i);
             tangents.q[i * n..][..n].copy_from_slice(&workspace.mid.q);
             tangents.velocity[i * n..][..n].copy_from_slice(&workspace.mid.velocity);
             self.take_rates(i, &mut tangents.velocity[i * n..][..n]);

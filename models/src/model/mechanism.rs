@@ -207,6 +207,11 @@ impl Spring {
         }
     }
 
+    /// Whether its force is a linear function of coordinates.
+    pub(crate) fn is_linear(&self) -> bool {
+        matches!(self, Self::Coordinate(_) | Self::Linear(_))
+    }
+
     /// The one joint that it acts on, as something between points.
     pub(crate) fn mover(&self) -> Option<Mover> {
         match self {

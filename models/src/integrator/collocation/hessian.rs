@@ -4,6 +4,7 @@ use plantd_math::scalar::Side;
 
 use crate::integrator::workspace::Workspace;
 use crate::lagrangian::arrangement::Planar;
+use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::model::mechanism::Model;
 
@@ -66,22 +67,37 @@ impl Hessian {
         }
     }
 
+    /// Adds springs and armatures, of the stages from one on.
+    pub(super) fn add_springs<S: Side>(
+        &mut self,
+        model: &Model,
+        poses: &Poses<S>,
+        q: &[S],
+        stage: usize,
+    ) {
+        let d = model.dimensions;
+        let (n, width) = (d.coordinates(), self.width);
+        let Self { qq, vv, .. } = self;
+        model.for_each_spring_derivative(poses, q, |i, j, k| {
+            if i < d.dynamic {
+                let entry = &mut qq[(i * n + j) * width + stage..];
+                (S::load(entry) - k).store(entry);
+            }
+        });
+        for a in &model.armature {
+            let entry = &mut vv[(a.row * n + a.column) * width + stage..];
+            (S::load(entry) + a.inertia).store(entry);
+        }
+    }
+
     /// Adds springs and forces at the last evaluation of the workspace, of one stage.
     pub(super) fn add_forces(&mut self, model: &Model, workspace: &Workspace, stage: usize) {
         let d = model.dimensions;
         let (n, nd, width) = (d.coordinates(), d.dynamic, self.width);
-        let Self { qq, qv, vv, qu, .. } = self;
         if model.potentials.any {
-            let (poses, q) = (&workspace.mid.mechanics.poses, &workspace.mid.q);
-            model.for_each_spring_derivative(poses, q, |i, j, k| {
-                if i < nd {
-                    qq[(i * n + j) * width + stage] -= k;
-                }
-            });
-            for a in &model.armature {
-                vv[(a.row * n + a.column) * width + stage] += a.inertia;
-            }
+            self.add_springs(model, &workspace.mid.mechanics.poses, &workspace.mid.q, stage);
         }
+        let Self { qq, qv, qu, .. } = self;
         if let Some(forces) = &model.forces {
             let instant = workspace.mid.instant(model);
             forces.for_each_derivative(&instant, |i, j, by_q, by_v| {

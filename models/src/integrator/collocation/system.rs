@@ -24,9 +24,10 @@ use crate::integrator::scheme::Tableau;
 use crate::integrator::settings::Precision;
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::{StepContext, Workspace};
+use crate::lagrangian::armature;
 use crate::lagrangian::forces;
 use crate::lagrangian::mechanics::Mechanics;
-use crate::model::mechanism::Model;
+use crate::model::mechanism::{Model, Spring};
 
 /// Rounds of corrections beyond which shorter steps are the better way.
 const ROUNDS: u32 = 16;
@@ -64,8 +65,12 @@ pub(crate) struct System<const N: usize> {
     count: usize,
     /// The stages, padded.
     width: usize,
-    /// Of each `N` stages; none if springs or forces are to be evaluated, one stage after the other.
+    /// Of each `N` stages; none if forces, or springs that are not linear, are to be evaluated, one stage after the
+    /// other.
     mechanics: Vec<Mechanics<LanesOf<N>>>,
+    /// Whole turns that configurations leave out, and configurations with them, of `N` stages.
+    turns: Vec<f64>,
+    positions: Vec<LanesOf<N>>,
     /// `μ_ij`, row after row, padded both ways.
     rows: Vec<LanesOf<N>>,
     /// `μ_ij`, column after column.
@@ -111,7 +116,8 @@ impl<const N: usize> System<N> {
         let count = tableau.nodes.len();
         let width = count.next_multiple_of(N);
         let groups = width / N;
-        let is_simple = !model.potentials.any && model.forces.is_none();
+        let mut springs = model.potentials.springs.iter();
+        let is_simple = model.forces.is_none() && springs.all(Spring::is_linear);
         let padded = |numbers: &[f64]| {
             let mut numbers = numbers.to_vec();
             numbers.resize(width, 0.0);
@@ -132,6 +138,8 @@ impl<const N: usize> System<N> {
             count,
             width,
             mechanics: vec![Mechanics::new(model); if is_simple { groups } else { 0 }],
+            turns: vec![0.0; d.coordinates()],
+            positions: lanes(d.coordinates()),
             rows,
             columns,
             weights: padded(&tableau.weights),
@@ -192,14 +200,12 @@ impl<const N: usize> System<N> {
     }
 
     /// Places a workspace at a stage.
-    pub(crate) fn place(&self, workspace: &mut Workspace, state: &PreciseState, stage: usize) {
-        let (n, lane) = (state.q.len(), stage % N);
+    pub(crate) fn place(&self, workspace: &mut Workspace, stage: usize) {
+        let (n, lane) = (self.turns.len(), stage % N);
         let at = stage / N * n;
         for (a, (q, v)) in self.q[at..].iter().zip(&self.velocity[at..]).take(n).enumerate() {
-            let per_radian = workspace.mid.turns_per_radian.get(a).copied().unwrap_or_default();
-            let turns = state.q[a] - without_turns(state.q[a], per_radian)[0];
             workspace.mid.angles[a] = q.0[lane];
-            workspace.mid.q[a] = q.0[lane] + turns;
+            workspace.mid.q[a] = q.0[lane] + self.turns[a];
             workspace.mid.velocity[a] = v.0[lane];
         }
         if let Some(balls) = &self.balls {
@@ -245,6 +251,7 @@ impl<const N: usize> System<N> {
         }
         for (start, &a) in self.start.iter_mut().zip(&self.plain) {
             *start = without_turns(state.q[a], turns_per_radian[a]);
+            self.turns[a] = state.q[a] - start[0];
         }
         if let Some(balls) = &mut self.balls {
             balls.begin(state, &mut self.increment);
@@ -293,6 +300,9 @@ impl<const N: usize> System<N> {
                 let derivatives = [&mut self.l_q[own.clone()], &mut self.l_v[own]];
                 let orientations = self.balls.as_ref().map_or(&[][..], |b| b.orientations(g));
                 self.mechanics[g].gradient(model, q, orientations, velocity, derivatives);
+                if model.potentials.any {
+                    self.add_springs(model, g);
+                }
             }
             magnitude = magnitude.max(self.take_impulses(state, &model.damping, n, g));
             if let Some(balls) = &mut self.balls {
@@ -306,6 +316,23 @@ impl<const N: usize> System<N> {
             magnitude += closures.evaluate(at, &self.increment, self.width, balls);
         }
         magnitude
+    }
+
+    /// Adds springs and armatures to the derivatives of `L` at `N` stages.
+    fn add_springs(&mut self, model: &Model, g: usize) {
+        let (n, nd) = (self.turns.len(), model.dimensions.dynamic);
+        self.take_turns(g);
+        let (poses, velocity) = (&self.mechanics[g].poses, &self.velocity[g * n..][..n]);
+        model.add_spring_gradient(poses, &self.positions, &mut self.l_q[g * nd..][..nd]);
+        armature::add_momentum(&model.armature, velocity, &mut self.l_v[g * nd..][..nd]);
+    }
+
+    /// Configurations of `N` stages with their whole turns.
+    fn take_turns(&mut self, g: usize) {
+        let from = self.q[g * self.turns.len()..].iter().zip(&self.turns);
+        for (position, (q, turns)) in self.positions.iter_mut().zip(from) {
+            *position = *q + *turns;
+        }
     }
 
     /// Configurations and velocities of `N` stages, but of ball joints.
@@ -506,12 +533,12 @@ impl<const N: usize> System<N> {
         inputs: &[f64],
         stage: usize,
     ) {
-        let StepContext { model, state, .. } = at;
+        let model = at.model;
         let d = model.dimensions;
         if d.inputs > 0 {
             workspace.mid.set_inputs(model, &inputs[stage * d.inputs..][..d.inputs]);
         }
-        self.place(workspace, state, stage);
+        self.place(workspace, stage);
         workspace.mid.evaluate(model);
         let (first, lane) = (stage / N * d.dynamic, stage % N);
         for a in 0..d.dynamic {
@@ -772,8 +799,12 @@ impl<const N: usize> System<N> {
                 self.hessian.add_forces(model, workspace, stage);
             }
         }
-        for (g, mechanics) in self.mechanics.iter_mut().enumerate() {
-            self.hessian.take(model, mechanics, g * N);
+        for g in 0..self.mechanics.len() {
+            self.hessian.take(model, &mut self.mechanics[g], g * N);
+            if model.potentials.any {
+                self.take_turns(g);
+                self.hessian.add_springs(model, &self.mechanics[g].poses, &self.positions, g * N);
+            }
         }
     }
 
