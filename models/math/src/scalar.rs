@@ -135,10 +135,10 @@ pub trait Scalar:
     fn constant(value: f64) -> Self;
     /// The real part.
     fn value(self) -> f64;
-    /// The magnitude of the real part; of several numbers side by side the largest.
-    fn magnitude(self) -> f64 {
-        self.value().abs()
-    }
+    /// What magnitudes are: reals, as many side by side.
+    type Magnitude: Scalar;
+    /// The magnitude of the real part.
+    fn magnitude(self) -> Self::Magnitude;
     /// Whether it is several numbers side by side: then all code pays in wide registers.
     const IS_SEVERAL: bool = false;
     /// Runs a block in registers that suit these numbers; see [`wide!`].
@@ -249,6 +249,11 @@ impl Scalar for f64 {
     fn recip(self) -> Self {
         self.recip()
     }
+    type Magnitude = Self;
+    #[inline(always)]
+    fn magnitude(self) -> Self {
+        self.abs()
+    }
     #[inline(always)]
     fn roots(self) -> [Self; 2] {
         let root = self.sqrt();
@@ -307,6 +312,11 @@ impl<S: Scalar> Scalar for Dual<S> {
     fn sqrt(self) -> Self {
         let root = self.re.sqrt();
         Self::new(root, self.eps * root.recip() * 0.5)
+    }
+    type Magnitude = S::Magnitude;
+    #[inline(always)]
+    fn magnitude(self) -> S::Magnitude {
+        self.re.magnitude()
     }
     #[inline(always)]
     fn roots(self) -> [Self; 2] {
@@ -448,9 +458,10 @@ impl<const N: usize> Scalar for LanesOf<N> {
     fn roots(self) -> [Self; 2] {
         [self.each(f64::sqrt), self.each(|x| x.roots()[1])]
     }
+    type Magnitude = Self;
     #[inline(always)]
-    fn magnitude(self) -> f64 {
-        self.0.into_iter().fold(0.0, |most, x| most.max(x.abs()))
+    fn magnitude(self) -> Self {
+        self.each(f64::abs)
     }
     #[inline(always)]
     fn tanh(self) -> Self {

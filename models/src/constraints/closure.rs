@@ -33,11 +33,11 @@ pub(crate) struct Closure<S: Scalar = f64> {
     /// Values `h`, one per equation.
     pub(crate) value: Vec<S>,
     /// Round-off of each value: what `h` may be at an exact solution.
-    pub(crate) round_off: Vec<f64>,
+    pub(crate) round_off: Vec<S::Magnitude>,
     /// `Dh`, row-major, nc by nd + nk.
     pub(crate) jacobian: Vec<S>,
     /// Change of `h` by round-off of the coordinates, from the last Jacobian.
-    coordinate_round_off: Vec<f64>,
+    coordinate_round_off: Vec<S::Magnitude>,
     /// What pulls at each joint, for second derivatives.
     pulls: Vec<Pull<S>>,
     /// Of a distance, by the coordinates on the path between its ends.
@@ -52,17 +52,19 @@ pub(crate) struct Closure<S: Scalar = f64> {
 
 /// `Σ |h_i q_i|`.
 #[inline(always)]
-fn moved<S: Scalar>(row: &[S], q: &[S]) -> f64 {
+fn moved<S: Scalar>(row: &[S], q: &[S]) -> S::Magnitude {
     let ((rows, row), (all, q)) = (row.as_chunks::<4>(), q.as_chunks::<4>());
     let product = |entry: S, q: S| (entry * q).magnitude();
-    let mut sums = [0.0; 4];
+    let mut sums = [S::Magnitude::ZERO; 4];
     for (row, q) in rows.iter().zip(all) {
         for (sum, (entry, q)) in sums.iter_mut().zip(row.iter().zip(q)) {
             *sum += product(*entry, *q);
         }
     }
-    let rest: f64 = row.iter().zip(q).map(|(entry, q)| product(*entry, *q)).sum();
-    sums.iter().sum::<f64>() + rest
+    let [mut total, mut rest] = [S::Magnitude::ZERO; 2];
+    sums.into_iter().for_each(|sum| total += sum);
+    row.iter().zip(q).for_each(|(entry, q)| rest += product(*entry, *q));
+    total + rest
 }
 
 /// Multipliers of equations along world axes as forces `f` at the points `p` that a joint carries.
@@ -114,9 +116,9 @@ impl<S: Scalar> Closure<S> {
         Self {
             poses: Poses::new(&model.closure),
             value: vec![S::ZERO; nc],
-            round_off: vec![0.0; nc],
+            round_off: vec![S::Magnitude::ZERO; nc],
             jacobian: vec![S::ZERO; nc * model.dimensions.coordinates()],
-            coordinate_round_off: vec![0.0; nc],
+            coordinate_round_off: vec![S::Magnitude::ZERO; nc],
             pulls: vec![Pull::NONE; model.closure.joints.len()],
             gradients: Vec::with_capacity(model.closure.joints.len()),
             known: Known::Nothing,
@@ -139,7 +141,7 @@ impl<S: Scalar> Closure<S> {
                 for c in together.clone() {
                     // Not less than what the smallest numbers are rounded by: some terms may all be zero.
                     self.round_off[c] =
-                        f64::EPSILON * magnitude + self.coordinate_round_off[c] + f64::MIN_POSITIVE;
+                        magnitude * f64::EPSILON + self.coordinate_round_off[c] + f64::MIN_POSITIVE;
                 }
                 c = together.end;
             }
@@ -147,8 +149,9 @@ impl<S: Scalar> Closure<S> {
     }
 
     /// Takes over how round-off of the coordinates changes the values, until the next Jacobian.
-    pub(crate) fn expect_round_off_of<T: Scalar>(&mut self, other: &Closure<T>) {
-        self.coordinate_round_off.copy_from_slice(&other.coordinate_round_off);
+    pub(crate) fn expect_round_off_of(&mut self, other: &Closure) {
+        let pairs = self.coordinate_round_off.iter_mut().zip(&other.coordinate_round_off);
+        pairs.for_each(|(own, other)| *own = S::Magnitude::constant(*other));
     }
 
     /// Jacobian at the configuration of the last [`Closure::evaluate`].
@@ -166,18 +169,9 @@ impl<S: Scalar> Closure<S> {
             }
             let rows = self.jacobian.chunks_exact(n).zip(&mut self.coordinate_round_off);
             for (row, round_off) in rows {
-                *round_off = f64::EPSILON * moved(row, q);
+                *round_off = moved(row, q) * f64::EPSILON;
             }
         })
-    }
-
-    /// Largest violation in units of its round-off.
-    pub(crate) fn violation(&self) -> f64 {
-        let relative = |(value, round_off): (&S, &f64)| {
-            let value = value.value();
-            if value == 0.0 { 0.0 } else { value.abs() / round_off }
-        };
-        self.value.iter().zip(&self.round_off).map(relative).fold(0.0, larger)
     }
 
     /// `out_i −= Σ_c Dh[c, i] λ_c` for the dynamic coordinates.
@@ -322,6 +316,13 @@ impl<S: Scalar> Closure<S> {
 }
 
 impl Closure {
+    /// Largest violation in units of its round-off.
+    pub(crate) fn violation(&self) -> f64 {
+        let relative =
+            |(h, round_off): (&f64, &f64)| if *h == 0.0 { 0.0 } else { h.abs() / round_off };
+        self.value.iter().zip(&self.round_off).map(relative).fold(0.0, larger)
+    }
+
     /// Evaluates all there is at a configuration.
     pub(crate) fn complete(&mut self, model: &Model, q: &[f64], orientations: &[Mat3]) {
         self.evaluate(model, q, orientations);

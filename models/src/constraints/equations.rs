@@ -28,7 +28,7 @@ pub(crate) trait Equation {
     }
 
     /// Writes `h` of the equations that are found at once; returns the magnitude of what was added for each.
-    fn value<S: Scalar>(&self, at: Place<'_, S>, values: &mut [S]) -> f64;
+    fn value<S: Scalar>(&self, at: Place<'_, S>, values: &mut [S]) -> S::Magnitude;
 
     /// Writes their `h_i` into rows of the Jacobian, which are zero; others follow.
     fn differentiate<S: Scalar>(&self, at: Place<'_, S>, rows: &mut [S]);
@@ -68,7 +68,7 @@ impl Constraint {
     }
 
     #[inline]
-    pub(crate) fn value<S: Scalar>(&self, at: Place<'_, S>, values: &mut [S]) -> f64 {
+    pub(crate) fn value<S: Scalar>(&self, at: Place<'_, S>, values: &mut [S]) -> S::Magnitude {
         match &self.kind {
             ConstraintKind::Distance(equation) => equation.value(at, values),
             ConstraintKind::Axis(equation) => equation.value(at, values),

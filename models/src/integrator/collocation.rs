@@ -197,3 +197,53 @@ fn explain(workspace: &mut Workspace, at: StepContext<'_>, error: StepError) -> 
     }
     at.model.explain(error, at, &workspace.step.q_end)
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use plantd_math::simd::{AVX2, PORTABLE, within};
+    use plantd_scene::builtin;
+
+    use super::*;
+    use crate::integrator::settings::Settings;
+    use crate::lagrangian::samples;
+    use crate::plant::facade::Plant;
+    use crate::plant::initial::Initial;
+
+    /// Four stages side by side and eight: hinges and ball joints, with constraints and without.
+    #[test]
+    fn all_registers_give_the_same_motion() {
+        let named = |name: &str| Model::compile(&builtin::scene(name).unwrap()).unwrap();
+        let elements = samples::models().into_iter().filter(|model| {
+            let d = model.dimensions;
+            d.prescribed == 0 && d.constraints > 0 && !model.orientations.is_empty()
+        });
+        let builtins = ["chain-4", "spherical-pendulum", "tree-15", "four-bar", "balls-3"];
+        for model in builtins.map(named).into_iter().chain(elements).map(Arc::new) {
+            for order in [12, 16] {
+                let settings = Settings { order, time_step_s: 0.01, ..Settings::new(&model) };
+                let motion = |registers| {
+                    within(registers, || {
+                        let mut plant = Plant::new(Arc::clone(&model), settings).unwrap();
+                        let q = plant.q().to_vec();
+                        let v = vec![0.0; q.len()];
+                        plant.initialize(&Initial::Velocity { q, v }).unwrap();
+                        let mut linear = Linearization::new(&model);
+                        let u = vec![0.3; model.dimensions.input()];
+                        for _ in 0..5 {
+                            plant.step_and_linearize(&u, &mut linear).unwrap();
+                        }
+                        (plant.q().to_vec(), plant.p().to_vec(), linear.a(), linear.b())
+                    })
+                };
+                let widest = motion(AVX512);
+                assert!(
+                    widest == motion(AVX2) && widest == motion(PORTABLE),
+                    "{}, order {order}",
+                    model.scene.name
+                );
+            }
+        }
+    }
+}

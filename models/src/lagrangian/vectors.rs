@@ -12,12 +12,12 @@ use crate::model::tree::{Tree, WORLD};
 
 /// `a − b` in world axes, and both points relative to the origins of their trees.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Separation<S = f64> {
+pub(crate) struct Separation<S: Scalar = f64> {
     pub(crate) difference: Vec3<S>,
     pub(crate) a: Vec3<S>,
     pub(crate) b: Vec3<S>,
     /// Magnitude of what was subtracted, for round-off estimates.
-    pub(crate) magnitude: f64,
+    pub(crate) magnitude: S::Magnitude,
 }
 
 impl PointPair {
@@ -45,7 +45,7 @@ impl PointPair {
 
 /// Length of the real part.
 #[inline(always)]
-fn size<S: Scalar>(v: Vec3<S>) -> f64 {
+fn size<S: Scalar>(v: Vec3<S>) -> S::Magnitude {
     Vec3(v.0.map(S::magnitude)).norm()
 }
 
@@ -141,7 +141,7 @@ impl<'a, S: Scalar> Distance<'a, S> {
     }
 
     /// Magnitude of what was subtracted, for round-off estimates.
-    pub(crate) fn magnitude(&self) -> f64 {
+    pub(crate) fn magnitude(&self) -> S::Magnitude {
         self.at.magnitude
     }
 
@@ -201,7 +201,7 @@ impl<'a, S: Scalar> ProductAt<'a, S> {
     }
 
     /// Magnitude of what was subtracted, for round-off estimates.
-    pub(crate) fn magnitude(&self) -> f64 {
+    pub(crate) fn magnitude(&self) -> S::Magnitude {
         let magnitude = |vector, value: Vec3<S>| match vector {
             Vector::Difference => self.at.magnitude,
             _ => size(value),

@@ -266,9 +266,10 @@ impl<E: Eight, L: Eight> Scalar for Sides<E, L> {
     fn roots(self) -> [Self; 2] {
         [self.sqrt(), self.each(|x| x.roots()[1])]
     }
+    type Magnitude = Self;
     #[inline(always)]
-    fn magnitude(self) -> f64 {
-        LanesOf(self.block().0).magnitude()
+    fn magnitude(self) -> Self {
+        self.signed(Self::ONE)
     }
     fn tanh(self) -> Self {
         self.each(libm::tanh)

@@ -38,7 +38,11 @@ impl Equation for AlongAxis {
     }
 
     #[inline(always)]
-    fn value<S: Scalar>(&self, Place { tree, poses, .. }: Place<'_, S>, values: &mut [S]) -> f64 {
+    fn value<S: Scalar>(
+        &self,
+        Place { tree, poses, .. }: Place<'_, S>,
+        values: &mut [S],
+    ) -> S::Magnitude {
         let at = self.points.separation(tree, poses);
         for (axis, value) in self.axes().zip(values) {
             *value = at.difference[axis];

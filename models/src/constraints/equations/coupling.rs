@@ -16,8 +16,9 @@ impl Equation for Coupling {
     }
 
     #[inline(never)]
-    fn value<S: Scalar>(&self, Place { q, .. }: Place<'_, S>, values: &mut [S]) -> f64 {
-        let (mut value, mut magnitude) = (S::constant(self.constant), self.constant.abs());
+    fn value<S: Scalar>(&self, Place { q, .. }: Place<'_, S>, values: &mut [S]) -> S::Magnitude {
+        let (mut value, mut magnitude) =
+            (S::constant(self.constant), S::Magnitude::constant(self.constant.abs()));
         for term in &self.terms {
             let term = term.value(q);
             value += term;

@@ -18,7 +18,11 @@ impl Equation for PathLength {
     }
 
     #[inline(never)]
-    fn value<S: Scalar>(&self, Place { tree, poses, q }: Place<'_, S>, values: &mut [S]) -> f64 {
+    fn value<S: Scalar>(
+        &self,
+        Place { tree, poses, q }: Place<'_, S>,
+        values: &mut [S],
+    ) -> S::Magnitude {
         let length = self.length.at(q);
         let (mut value, mut magnitude) = (-length, length.magnitude());
         for segment in &self.segments {

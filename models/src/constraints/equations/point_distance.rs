@@ -17,13 +17,17 @@ impl Equation for PointDistance {
     }
 
     #[inline(always)]
-    fn value<S: Scalar>(&self, Place { tree, poses, q }: Place<'_, S>, values: &mut [S]) -> f64 {
+    fn value<S: Scalar>(
+        &self,
+        Place { tree, poses, q }: Place<'_, S>,
+        values: &mut [S],
+    ) -> S::Magnitude {
         let at = self.points.separation(tree, poses);
         let length = self.length.at(q);
         let square = at.difference.dot(at.difference);
         let squared_length = length * length;
         values[0] = square - squared_length;
-        2.0 * square.magnitude().sqrt() * at.magnitude + squared_length.magnitude()
+        square.magnitude().sqrt() * at.magnitude * 2.0 + squared_length.magnitude()
     }
 
     #[inline(always)]

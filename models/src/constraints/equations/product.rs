@@ -19,7 +19,11 @@ impl Equation for Product {
     }
 
     #[inline(always)]
-    fn value<S: Scalar>(&self, Place { tree, poses, .. }: Place<'_, S>, values: &mut [S]) -> f64 {
+    fn value<S: Scalar>(
+        &self,
+        Place { tree, poses, .. }: Place<'_, S>,
+        values: &mut [S],
+    ) -> S::Magnitude {
         let at = ProductAt::new(self, tree, poses);
         values[0] = at.value();
         at.magnitude()

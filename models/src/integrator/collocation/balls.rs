@@ -286,7 +286,9 @@ impl<const N: usize> Balls<N> {
             for ((&c, chart), torque) in coordinates.iter().zip(charts).zip(&mut nodes.torque) {
                 let push = three(pushes, c);
                 let turned = chart.exp().apply(push);
-                *torque += Vec3(turned.0.map(|all| all.0.iter().sum()));
+                for (sum, all) in torque.0.iter_mut().zip(turned.0) {
+                    *sum = all.0.into_iter().fold(*sum, |sum, x| sum + x);
+                }
                 pushes[c..c + 3].copy_from_slice(&chart.dexp().apply_transposed(push).0);
             }
         })

@@ -303,13 +303,17 @@ impl<const N: usize> Closures<N> {
 
     /// Largest violation in units of its round-off.
     pub(super) fn violation(&self) -> f64 {
-        let nc = self.equations();
-        let relative = |c: usize| {
-            let value = self.values[c..].iter().step_by(nc).fold(0.0, |most, h| larger(most, *h));
-            let round_off = self.beside.iter().fold(0.0, |most, at| larger(most, at.round_off[c]));
-            if value == 0.0 { 0.0 } else { value / round_off }
-        };
-        (0..nc).map(relative).fold(0.0, larger)
+        let mut largest = 0.0;
+        for (g, at) in self.beside.iter().enumerate() {
+            let nodes = N.min(self.count - g * N);
+            for (value, round_off) in at.value.iter().zip(&at.round_off) {
+                for (h, round_off) in value.0.iter().zip(round_off.0).take(nodes) {
+                    let violation = if *h == 0.0 { 0.0 } else { h.abs() / round_off };
+                    largest = larger(largest, violation);
+                }
+            }
+        }
+        largest
     }
 
     /// Adds the impulses to the residuals of the stages.

@@ -23,7 +23,7 @@ use crate::model::tree::{Attachment, WORLD};
 const NOTHING: f64 = 1e-100;
 
 /// The force at one instant.
-struct Acting<S> {
+struct Acting<S: Scalar> {
     law: PointLaw,
     at: Separation<S>,
     rate: Vec3<S>,

@@ -19,7 +19,7 @@ use crate::model::mechanism::{Carries, PointSpring};
 use crate::model::tree::WORLD;
 
 /// A two-point spring at one configuration.
-struct Stretched<S> {
+struct Stretched<S: Scalar> {
     at: Separation<S>,
     /// `t = V_l / l`.
     tension: S,
