@@ -36,7 +36,6 @@ use crate::integrator::collocation::system::System;
 use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::scheme::Tableau;
 use crate::integrator::workspace::{StepContext, Workspace};
-use crate::linearization::linearize::Linearization;
 use crate::model::mechanism::Model;
 
 /// Unknowns up to which the dense Jacobian is taken. With 28 (an arm at order 8) rounds with the mass matrices take as
@@ -54,13 +53,13 @@ pub(crate) struct Collocation {
     /// Velocities at the stages of the solution, one after the other, then forces `L_q + f`; of ball joints angular
     /// velocities.
     pub(crate) motion: Vec<f64>,
-    stages: Stages,
+    pub(crate) stages: Stages,
 }
 
 /// The stages, in registers that suit them. A few more than four lie in one of eight, which takes about as long as
 /// one of four.
 #[derive(Clone, Debug)]
-enum Stages {
+pub(crate) enum Stages {
     Fours(Box<System<4>>),
     Eights(Box<System<8>>),
 }
@@ -69,11 +68,12 @@ enum Stages {
 macro_rules! with_stages {
     ($stages:expr, $system:ident => $result:expr) => {
         match $stages {
-            Stages::Fours($system) => $result,
-            Stages::Eights($system) => $result,
+            $crate::integrator::collocation::Stages::Fours($system) => $result,
+            $crate::integrator::collocation::Stages::Eights($system) => $result,
         }
     };
 }
+pub(crate) use with_stages;
 
 impl Collocation {
     pub(crate) fn new(model: &Model, stages: usize) -> Self {
@@ -109,17 +109,6 @@ impl Collocation {
         self.guess(workspace, at, start_s)?;
         let Self { tableau, inputs, motion, stages } = self;
         with_stages!(stages, system => system.solve(workspace, at, tableau, [inputs, motion]))
-    }
-
-    /// Linearizes at the solution of the last step.
-    pub(crate) fn linearize(
-        &mut self,
-        workspace: &mut Workspace,
-        at: StepContext<'_>,
-        out: &mut Linearization,
-    ) -> Result<(), StepError> {
-        let Self { tableau, inputs, stages, .. } = self;
-        with_stages!(stages, system => system.linearize(workspace, at, tableau, inputs, out))
     }
 
     /// Guesses the motion; takes the inputs of the stages.
@@ -196,54 +185,4 @@ fn explain(workspace: &mut Workspace, at: StepContext<'_>, error: StepError) -> 
         workspace.prepare(at);
     }
     at.model.explain(error, at, &workspace.step.q_end)
-}
-
-#[cfg(test)]
-mod tests {
-    use std::sync::Arc;
-
-    use plantd_math::simd::{AVX2, PORTABLE, within};
-    use plantd_scene::builtin;
-
-    use super::*;
-    use crate::integrator::settings::Settings;
-    use crate::lagrangian::samples;
-    use crate::plant::facade::Plant;
-    use crate::plant::initial::Initial;
-
-    /// Four stages side by side and eight: hinges and ball joints, with constraints and without.
-    #[test]
-    fn all_registers_give_the_same_motion() {
-        let named = |name: &str| Model::compile(&builtin::scene(name).unwrap()).unwrap();
-        let elements = samples::models().into_iter().filter(|model| {
-            let d = model.dimensions;
-            d.prescribed == 0 && d.constraints > 0 && !model.orientations.is_empty()
-        });
-        let builtins = ["chain-4", "spherical-pendulum", "tree-15", "four-bar", "balls-3"];
-        for model in builtins.map(named).into_iter().chain(elements).map(Arc::new) {
-            for order in [12, 16] {
-                let settings = Settings { order, time_step_s: 0.01, ..Settings::new(&model) };
-                let motion = |registers| {
-                    within(registers, || {
-                        let mut plant = Plant::new(Arc::clone(&model), settings).unwrap();
-                        let q = plant.q().to_vec();
-                        let v = vec![0.0; q.len()];
-                        plant.initialize(&Initial::Velocity { q, v }).unwrap();
-                        let mut linear = Linearization::new(&model);
-                        let u = vec![0.3; model.dimensions.input()];
-                        for _ in 0..5 {
-                            plant.step_and_linearize(&u, &mut linear).unwrap();
-                        }
-                        (plant.q().to_vec(), plant.p().to_vec(), linear.a(), linear.b())
-                    })
-                };
-                let widest = motion(AVX512);
-                assert!(
-                    widest == motion(AVX2) && widest == motion(PORTABLE),
-                    "{}, order {order}",
-                    model.scene.name
-                );
-            }
-        }
-    }
 }

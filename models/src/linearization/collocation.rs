@@ -23,6 +23,7 @@ use plantd_math::spatial::{Mat3, three};
 use crate::integrator::collocation::closures::Closures;
 use crate::integrator::collocation::slopes::{Closing, Slopes};
 use crate::integrator::collocation::system::System;
+use crate::integrator::collocation::{Collocation, with_stages};
 use crate::integrator::parameters::Parameters;
 use crate::integrator::report::StepError;
 use crate::integrator::scheme::Tableau;
@@ -31,9 +32,22 @@ use crate::integrator::workspace::{StepContext, Workspace};
 use crate::lagrangian::turning::Turning;
 use crate::linearization::linearize::{Linearization, NodeTangents, StageTangents};
 
-impl<const N: usize> System<N> {
+impl Collocation {
     /// Linearizes at the solution of the last step.
     pub(crate) fn linearize(
+        &mut self,
+        workspace: &mut Workspace,
+        at: StepContext<'_>,
+        out: &mut Linearization,
+    ) -> Result<(), StepError> {
+        let Self { tableau, inputs, stages, .. } = self;
+        with_stages!(stages, system => system.linearize(workspace, at, tableau, inputs, out))
+    }
+}
+
+impl<const N: usize> System<N> {
+    /// [`Collocation::linearize`].
+    fn linearize(
         &mut self,
         workspace: &mut Workspace,
         at: StepContext<'_>,
@@ -250,6 +264,57 @@ impl StageTangents {
                 terms.extend((0..count).map(|j| (coupling[i * count + j], a * count + j)));
                 let target = &mut tangent[(a * count + i) * stride..][..stride];
                 add_rows(target, impulses, stride, terms);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use plantd_math::simd::{AVX2, AVX512, PORTABLE, within};
+    use plantd_scene::builtin;
+
+    use super::*;
+    use crate::integrator::settings::Settings;
+    use crate::lagrangian::samples;
+    use crate::model::mechanism::Model;
+    use crate::plant::facade::Plant;
+    use crate::plant::initial::Initial;
+
+    /// Four stages side by side and eight: hinges and ball joints, with constraints and without.
+    #[test]
+    fn all_registers_give_the_same_motion() {
+        let named = |name: &str| Model::compile(&builtin::scene(name).unwrap()).unwrap();
+        let elements = samples::models().into_iter().filter(|model| {
+            let d = model.dimensions;
+            d.prescribed == 0 && d.constraints > 0 && !model.orientations.is_empty()
+        });
+        let builtins = ["chain-4", "spherical-pendulum", "tree-15", "four-bar", "balls-3"];
+        for model in builtins.map(named).into_iter().chain(elements).map(Arc::new) {
+            for order in [12, 16] {
+                let settings = Settings { order, time_step_s: 0.01, ..Settings::new(&model) };
+                let motion = |registers| {
+                    within(registers, || {
+                        let mut plant = Plant::new(Arc::clone(&model), settings).unwrap();
+                        let q = plant.q().to_vec();
+                        let v = vec![0.0; q.len()];
+                        plant.initialize(&Initial::Velocity { q, v }).unwrap();
+                        let mut linear = Linearization::new(&model);
+                        let u = vec![0.3; model.dimensions.input()];
+                        for _ in 0..5 {
+                            plant.step_and_linearize(&u, &mut linear).unwrap();
+                        }
+                        (plant.q().to_vec(), plant.p().to_vec(), linear.a(), linear.b())
+                    })
+                };
+                let widest = motion(AVX512);
+                assert!(
+                    widest == motion(AVX2) && widest == motion(PORTABLE),
+                    "{}, order {order}",
+                    model.scene.name
+                );
             }
         }
     }
