@@ -67,6 +67,12 @@ fn moved<S: Scalar>(row: &[S], q: &[S]) -> S::Magnitude {
     total + rest
 }
 
+/// A violation in units of its round-off.
+#[inline(always)]
+pub(crate) fn in_units(h: f64, round_off: f64) -> f64 {
+    if h == 0.0 { 0.0 } else { h.abs() / round_off }
+}
+
 /// Multipliers of equations along world axes as forces `f` at the points `p` that a joint carries.
 #[derive(Clone, Copy, Debug)]
 struct Pull<S> {
@@ -318,9 +324,8 @@ impl<S: Scalar> Closure<S> {
 impl Closure {
     /// Largest violation in units of its round-off.
     pub(crate) fn violation(&self) -> f64 {
-        let relative =
-            |(h, round_off): (&f64, &f64)| if *h == 0.0 { 0.0 } else { h.abs() / round_off };
-        self.value.iter().zip(&self.round_off).map(relative).fold(0.0, larger)
+        let pairs = self.value.iter().zip(&self.round_off);
+        pairs.map(|(h, round_off)| in_units(*h, *round_off)).fold(0.0, larger)
     }
 
     /// Evaluates all there is at a configuration.

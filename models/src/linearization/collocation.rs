@@ -90,7 +90,6 @@ impl<const N: usize> System<N> {
         tangents.inputs.copy_from_slice(inputs);
         workspace.prepare(at);
         if let Some(closures) = &mut self.closures {
-            closures.spread();
             closures.curve(model, true);
         }
         self.fill_matrix(at);

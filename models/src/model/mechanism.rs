@@ -273,9 +273,14 @@ impl Forces {
 
     /// Whether some act on single coordinates of ball joints.
     fn act_on_balls(&self, orientations: &[usize]) -> bool {
-        let of_ball = |i: usize| orientations.iter().any(|first| (*first..first + 3).contains(&i));
-        self.coordinate_forces.iter().any(|force| of_ball(force.coordinate))
+        let mut coordinates = self.coordinate_forces.iter().map(|force| force.coordinate);
+        coordinates.any(|i| ball_of(orientations, i).is_some())
     }
+}
+
+/// The first coordinate of the ball joint that a coordinate belongs to, with those of all ball joints.
+pub(crate) fn ball_of(orientations: &[usize], coordinate: usize) -> Option<usize> {
+    orientations.iter().copied().find(|first| (*first..first + 3).contains(&coordinate))
 }
 
 /// A wrench on a joint that carries a body.
@@ -792,9 +797,8 @@ impl Model {
         let of_forces =
             of_forces.chain(of_paths).filter(move |(coordinate, _)| *coordinate < dynamic);
         on_coordinates.chain(of_forces).flat_map(|(coordinate, input)| {
-            let is_axis = |first: &&usize| (**first..**first + 3).contains(&coordinate);
-            let rows = match self.orientations.iter().find(is_axis) {
-                Some(&first) => first..first + 3,
+            let rows = match ball_of(&self.orientations, coordinate) {
+                Some(first) => first..first + 3,
                 None => coordinate..coordinate + 1,
             };
             rows.map(move |row| (row, input))

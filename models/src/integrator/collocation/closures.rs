@@ -24,7 +24,7 @@ use plantd_math::rows::{Term, add_rows, padded};
 use plantd_math::scalar::{Compared, LanesOf, Scalar, in_registers};
 use plantd_math::spatial::Mat3;
 
-use crate::constraints::closure::Closure;
+use crate::constraints::closure::{Closure, in_units};
 use crate::integrator::collocation::balls::Balls;
 use crate::integrator::collocation::slopes::{Closing, Slopes};
 use crate::integrator::parameters::Parameters;
@@ -84,6 +84,26 @@ pub(crate) struct Closures<const N: usize> {
     /// Of the responses, how far each coordinate gets to a node; of a correction, in its first column.
     moved: Vec<f64>,
     terms: Vec<Term>,
+}
+
+/// Writes the impulses `−Dhᵀ Λ`, and the magnitudes of what they are the sums of.
+#[inline(always)]
+fn push<S: Compared>(
+    model: &Model,
+    jacobian: &[S],
+    multipliers: &[S],
+    [pushes, sizes]: [&mut [S]; 2],
+) {
+    pushes.fill(S::ZERO);
+    sizes.fill(S::ZERO);
+    let rows = jacobian.chunks_exact(model.dimensions.coordinates()).zip(multipliers);
+    for (constraint, (row, lambda)) in model.constraints.iter().zip(rows) {
+        for &a in constraint.dynamic_coordinates() {
+            let push = row[a] * *lambda;
+            pushes[a] -= push;
+            sizes[a] += push.abs();
+        }
+    }
 }
 
 impl<const N: usize> Closures<N> {
@@ -248,25 +268,15 @@ impl<const N: usize> Closures<N> {
 
     /// Impulses of the start; returns what they are the sums of, at most.
     fn push_at_start(&mut self, model: &Model) -> f64 {
-        let n = model.dimensions.coordinates();
         let sizes = &mut self.moved[..self.start_pushes.len()];
-        sizes.fill(0.0);
-        self.start_pushes.fill(0.0);
-        for (c, constraint) in model.constraints.iter().enumerate() {
-            let (row, lambda) = (&self.start.jacobian[c * n..][..n], self.multipliers[c]);
-            for &a in constraint.dynamic_coordinates() {
-                let push = row[a] * lambda;
-                self.start_pushes[a] -= push;
-                sizes[a] += push.abs();
-            }
-        }
+        let multipliers = &self.multipliers[..model.constraints.len()];
+        push(model, &self.start.jacobian, multipliers, [&mut self.start_pushes, &mut *sizes]);
         sizes.iter().copied().fold(0.0, larger)
     }
 
     /// Values and impulses of `N` nodes; returns what impulses are the sums of, at most.
     fn push(&mut self, model: &Model, g: usize) -> f64 {
-        let (nd, n) = (self.start_pushes.len(), model.dimensions.coordinates());
-        let nc = model.constraints.len();
+        let (nd, nc) = (self.start_pushes.len(), model.constraints.len());
         self.take_multipliers(g);
         in_registers!(LanesOf<N>, {
             let (at, sizes) = (&self.beside[g], &mut self.sizes[..]);
@@ -277,16 +287,7 @@ impl<const N: usize> Closures<N> {
                 }
             }
             let pushes = &mut self.pushes[g * nd..][..nd];
-            pushes.fill(LanesOf::ZERO);
-            sizes.fill(LanesOf::ZERO);
-            let rows = at.jacobian.chunks_exact(n).zip(&self.multipliers_beside);
-            for (constraint, (row, lambda)) in model.constraints.iter().zip(rows) {
-                for &a in constraint.dynamic_coordinates() {
-                    let push = row[a] * *lambda;
-                    pushes[a] -= push;
-                    sizes[a] += push.abs();
-                }
-            }
+            push(model, &at.jacobian, &self.multipliers_beside, [pushes, &mut *sizes]);
             sizes.iter().flat_map(|size| size.0).fold(0.0, larger)
         })
     }
@@ -307,9 +308,8 @@ impl<const N: usize> Closures<N> {
         for (g, at) in self.beside.iter().enumerate() {
             let nodes = N.min(self.count - g * N);
             for (value, round_off) in at.value.iter().zip(&at.round_off) {
-                for (h, round_off) in value.0.iter().zip(round_off.0).take(nodes) {
-                    let violation = if *h == 0.0 { 0.0 } else { h.abs() / round_off };
-                    largest = larger(largest, violation);
+                for (h, round_off) in value.0.into_iter().zip(round_off.0).take(nodes) {
+                    largest = larger(largest, in_units(h, round_off));
                 }
             }
         }
@@ -338,7 +338,7 @@ impl<const N: usize> Closures<N> {
     }
 
     /// Writes what is known at the nodes one after the other: configurations and Jacobians.
-    pub(crate) fn spread(&mut self) {
+    fn spread(&mut self) {
         let n = self.start_q.len();
         let size = self.start.jacobian.len();
         self.q[..n].copy_from_slice(&self.start_q);
@@ -367,10 +367,12 @@ impl<const N: usize> Closures<N> {
         }
     }
 
-    /// Second derivatives at the last evaluation, of the start too where derivatives by it are asked for.
+    /// Second derivatives at the last evaluation, of the start too where derivatives by it are asked for, and all that
+    /// [`Closures::spread`] writes.
     pub(crate) fn curve(&mut self, model: &Model, with_start: bool) {
         let n = model.dimensions.coordinates();
         let (nc, size) = (self.equations(), n * n);
+        self.spread();
         if with_start {
             let (q, lambda) = (&self.start_q, &self.multipliers[..nc]);
             self.start.hessian(model, q, lambda, &mut self.hessians[..size]);

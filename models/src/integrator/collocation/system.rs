@@ -27,7 +27,7 @@ use crate::integrator::workspace::{StepContext, Workspace};
 use crate::lagrangian::armature;
 use crate::lagrangian::forces;
 use crate::lagrangian::mechanics::Mechanics;
-use crate::model::mechanism::{Model, Spring};
+use crate::model::mechanism::{Model, Spring, ball_of};
 
 /// Rounds of corrections beyond which shorter steps are the better way.
 const ROUNDS: u32 = 16;
@@ -130,8 +130,8 @@ impl<const N: usize> System<N> {
         let entries = (0..width).flat_map(|i| (0..width).step_by(N).map(move |j| (i, j)));
         let rows = entries.clone().map(|(i, j)| several(&|lane| coupling(i, j + lane))).collect();
         let columns = entries.map(|(j, i)| several(&|lane| coupling(i + lane, j))).collect();
-        let is_ball = |a: &usize| model.orientations.iter().any(|c| (*c..c + 3).contains(a));
-        let plain: Vec<usize> = (0..d.dynamic).filter(|a| !is_ball(a)).collect();
+        let is_plain = |a: &usize| ball_of(&model.orientations, *a).is_none();
+        let plain: Vec<usize> = (0..d.dynamic).filter(is_plain).collect();
         let zeros = || vec![0.0; d.dynamic * width];
         let lanes = |count: usize| vec![LanesOf::ZERO; count];
         Self {
@@ -584,7 +584,6 @@ impl<const N: usize> System<N> {
             if fresh {
                 self.differentiate(workspace, at, inputs);
                 if let Some(closures) = &mut self.closures {
-                    closures.spread();
                     closures.curve(model, false);
                 }
                 self.fill_matrix(at);

@@ -167,6 +167,15 @@ fn a_solution_satisfies_the_dense_system() {
     }
 }
 
+/// What generators solve at the last evaluation is the system that is filled entry by entry.
+fn assert_generates(plant: &mut Plant) {
+    let Plant { model, workspace, settings, .. } = plant;
+    workspace.fill_newton_matrix(model, settings);
+    let matrix = dense(model, &workspace.kkt.factored.tree);
+    assert!(workspace.factor_recursion(model, settings).unwrap());
+    assert_solves(workspace, model, &matrix);
+}
+
 fn assert_solves(workspace: &mut Workspace, model: &Model, matrix: &DMatrix<f64>) {
     let b = DVector::from_fn(matrix.nrows(), |i, _| wave(i + 7));
     let mut x = b.clone();
@@ -467,11 +476,7 @@ fn what_acts_from_the_world_is_generated() {
         let model = Arc::new(model);
         assert!(model.has_fields());
         let mut fast = move_alike(&model, steps);
-        let (workspace, settings) = (&mut fast.workspace, &fast.settings);
-        workspace.fill_newton_matrix(&model, settings);
-        let matrix = dense(&model, &workspace.kkt.factored.tree);
-        assert!(workspace.factor_recursion(&model, settings).unwrap());
-        assert_solves(workspace, &model, &matrix);
+        assert_generates(&mut fast);
     }
 }
 
@@ -529,11 +534,7 @@ fn what_acts_across_a_joint_is_generated() {
         let model = Arc::new(model);
         assert!(!model.has_fields());
         let mut fast = move_alike(&model, steps);
-        let (workspace, settings) = (&mut fast.workspace, &fast.settings);
-        workspace.fill_newton_matrix(&model, settings);
-        let matrix = dense(&model, &workspace.kkt.factored.tree);
-        assert!(workspace.factor_recursion(&model, settings).unwrap());
-        assert_solves(workspace, &model, &matrix);
+        assert_generates(&mut fast);
     }
     let far = between(&[["f3", "f9"]]);
     assert_eq!(compiled(&rope(32, &far)).solver, Solver::Tree);
