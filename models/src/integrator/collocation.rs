@@ -33,7 +33,7 @@ use plantd_math::scalar::Lanes;
 use plantd_math::simd::{AVX512, has};
 
 use crate::integrator::collocation::system::System;
-use crate::integrator::report::{StepError, StepReport};
+use crate::integrator::report::StepError;
 use crate::integrator::scheme::Tableau;
 use crate::integrator::workspace::{StepContext, Workspace};
 use crate::model::mechanism::Model;
@@ -98,14 +98,14 @@ impl Collocation {
         }
     }
 
-    /// Solves one step, which starts at a time; the solution stays here and in the workspace. `u` has no
+    /// Solves one step, which starts at a time; the solution stays here and in the workspace, with its report. `u` has no
     /// signals of inputs.
     pub(crate) fn solve(
         &mut self,
         workspace: &mut Workspace,
         at: StepContext<'_>,
         start_s: f64,
-    ) -> Result<StepReport, StepError> {
+    ) -> Result<(), StepError> {
         self.guess(workspace, at, start_s)?;
         let Self { tableau, inputs, motion, stages } = self;
         with_stages!(stages, system => system.solve(workspace, at, tableau, [inputs, motion]))
@@ -154,7 +154,7 @@ impl<const N: usize> System<N> {
         at: StepContext<'_>,
         tableau: &Tableau,
         [inputs, motion]: [&mut [f64]; 2],
-    ) -> Result<StepReport, StepError> {
+    ) -> Result<(), StepError> {
         self.begin(at, motion, inputs, &mut workspace.mid);
         let has_both = self.balls.is_some() && self.closures.is_some();
         let mut report = match self.correct_alike(workspace, at, inputs) {
@@ -174,7 +174,8 @@ impl<const N: usize> System<N> {
         if at.model.dimensions.constraints == 0 {
             workspace.kkt.estimates.write(&mut report);
         }
-        Ok(report)
+        workspace.step.report = report;
+        Ok(())
     }
 }
 

@@ -110,24 +110,15 @@ pub(crate) fn is_round_off<S: Compared>(correction: S, angle: S, increment: S) -
 }
 
 impl Workspace {
-    /// Solves one step; the solution stays in the workspace.
+    /// Solves one step; the solution stays in the workspace, with its report.
     #[inline]
-    pub(crate) fn solve(&mut self, at: StepContext<'_>) -> Result<StepReport, StepError> {
-        let report = if at.model.is_of_bodies() {
-            self.solve_as::<true>(at)
-        } else {
-            self.solve_as::<false>(at)
-        };
-        self.step.evaluations = report.as_ref().map_or(0, |report| report.iterations);
-        report
+    pub(crate) fn solve(&mut self, at: StepContext<'_>) -> Result<(), StepError> {
+        if at.model.is_of_bodies() { self.solve_as::<true>(at) } else { self.solve_as::<false>(at) }
     }
 
     /// `BODIES`: whether the model is one of bodies ([`Model::is_of_bodies`]). All others have no push and no end
     /// that is foreseen, and nothing of these in their steps.
-    fn solve_as<const BODIES: bool>(
-        &mut self,
-        at: StepContext<'_>,
-    ) -> Result<StepReport, StepError> {
+    fn solve_as<const BODIES: bool>(&mut self, at: StepContext<'_>) -> Result<(), StepError> {
         let StepContext { model, settings, state, .. } = at;
         self.prepare(at);
         let is_guessed = state.past.predict(&mut self.step.increment);
@@ -139,9 +130,8 @@ impl Workspace {
                 // The equations are linear in the multipliers: any guess is as good.
                 self.step.multipliers.copy_from_slice(&state.multipliers);
             }
-            let report = self.iterate::<BODIES>(model, settings, state, false);
-            if report.is_ok() {
-                return report;
+            if self.iterate::<BODIES>(model, settings, state, false).is_ok() {
+                return Ok(());
             }
         }
         self.ballistic(model, settings, state);
@@ -276,7 +266,7 @@ impl Workspace {
         settings: &Settings,
         state: &PreciseState,
         always_factor: bool,
-    ) -> Result<StepReport, StepError> {
+    ) -> Result<(), StepError> {
         let mut report = StepReport::default();
         let mut chord = Chord::<f64>::new(settings, self.kkt.corrections(), always_factor);
         let mut strayed = (BODIES && model.is_foreseen(settings)).then(Strayed::default);
@@ -383,7 +373,7 @@ impl Workspace {
         model: &Model,
         settings: &Settings,
         mut report: StepReport,
-    ) -> Result<StepReport, StepError> {
+    ) -> Result<(), StepError> {
         model.check_turns(&self.step.increment)?;
         self.find_impulse(model, settings);
         if BODIES && !self.step.is_evaluated {
@@ -399,7 +389,8 @@ impl Workspace {
             );
         }
         self.kkt.estimates.write(&mut report);
-        Ok(report)
+        self.step.report = report;
+        Ok(())
     }
 
     /// Constraints with Jacobian at the solution, for the linearization and the next step.

@@ -5,6 +5,7 @@ use plantd_math::rows::{Term, padded, spread};
 use crate::constraints::closure::{Closure, Known};
 use crate::integrator::balls::BallJoints;
 use crate::integrator::midpoint::Midpoint;
+use crate::integrator::report::StepReport;
 use crate::integrator::response::Response;
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
@@ -54,8 +55,8 @@ pub(crate) struct StepIncrement {
     pub(crate) q_end: Vec<f64>,
     /// Whether the last evaluation was at the increment.
     pub(crate) is_evaluated: bool,
-    /// How many evaluations the solution took.
-    pub(crate) evaluations: u32,
+    /// How it was solved. It stays here: to hand it on from function to function takes a tenth of a pendulum's step.
+    pub(crate) report: StepReport,
 }
 
 /// What a step's equations leave over; a correction takes its place.
@@ -149,7 +150,7 @@ impl Workspace {
                 impulse: zeros(nd),
                 q_end: zeros(n),
                 is_evaluated: false,
-                evaluations: 0,
+                report: StepReport::default(),
             },
             mid: Midpoint::new(model),
             balls: BallJoints::new(model),

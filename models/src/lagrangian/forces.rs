@@ -19,7 +19,14 @@ use crate::model::mechanism::{CoordinateInput, Forces, Mover, mover};
 /// Writes the input forces of a step; they do not change within it.
 #[inline(never)]
 pub(crate) fn input_forces<S: Scalar>(inputs: &[CoordinateInput], u: &[S], force: &mut [S]) {
-    force.fill(S::ZERO);
+    let (mut next, mut inputs) = (0, inputs.iter().peekable());
+    // Most act on a coordinate of their own, one after the other: what is written is not read again.
+    while let Some(input) = inputs.next_if(|input| input.coordinate >= next) {
+        force[next..input.coordinate].fill(S::ZERO);
+        force[input.coordinate] = S::ZERO + u[input.input] * input.gain;
+        next = input.coordinate + 1;
+    }
+    force[next..].fill(S::ZERO);
     for input in inputs {
         force[input.coordinate] += u[input.input] * input.gain;
     }

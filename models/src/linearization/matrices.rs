@@ -3,6 +3,7 @@
 //! Rows of a [`Linearization`] hold the derivatives of increments; `q[k+1] = q[k] + x` adds a one on the
 //! diagonal. Ball joints turn at their ends by `dexp₋ξ ξ' + exp(−ξ) η`.
 
+use plantd_math::eights::{Eight, InEights, in_eights};
 use plantd_math::rows::{Block, LANES};
 use plantd_math::simd::wide;
 use plantd_math::spatial::{Mat3, Vec3};
@@ -66,22 +67,14 @@ impl<'a> Target<'a> {
             }
             return;
         }
-        // Tile by tile, so that neither rows nor columns leave the nearest cache.
-        for top in (0..count).step_by(TILE) {
-            let height = TILE.min(count - top);
-            let lines = &source[top * stride..];
-            for left in (0..width).step_by(TILE) {
-                let end = width.min(left + TILE);
-                let whole = height == TILE;
-                for j in left..end {
-                    let to = &mut self.numbers[(column + j) * self.rows + row + top..][..height];
-                    if let (true, Some(to)) = (whole, to.first_chunk_mut::<TILE>()) {
-                        *to = std::array::from_fn(|i| lines[i * stride + j]);
-                    } else {
-                        to.iter_mut().zip(0..).for_each(|(to, i)| *to = lines[i * stride + j]);
-                    }
-                }
-            }
+        if count >= TILE && width >= TILE {
+            let (to, apart) = (&mut self.numbers[column * self.rows + row..], self.rows);
+            in_eights(Transpose { to, apart, source, stride, size: [count, width], factors: None });
+            return;
+        }
+        for j in 0..width {
+            let to = &mut self.numbers[(column + j) * self.rows + row..][..count];
+            to.iter_mut().zip(0..).for_each(|(to, i)| *to = source[i * stride + j]);
         }
     }
 
@@ -123,6 +116,29 @@ impl<'a> Target<'a> {
                 }
             }
         })
+    }
+
+    /// Copies `count` rows, `stride` apart, each number times what the input of its column gives to the residual.
+    fn copy_times(
+        &mut self,
+        source: &[f64],
+        stride: usize,
+        count: usize,
+        inputs: &[InputImpulse],
+        [row, column]: [usize; 2],
+    ) {
+        let width = inputs.len();
+        if self.layout == Layout::Columns && count >= TILE && width >= TILE {
+            let (to, apart) = (&mut self.numbers[column * self.rows + row..], self.rows);
+            let (size, factors) = ([count, width], Some(inputs));
+            in_eights(Transpose { to, apart, source, stride, size, factors });
+            return;
+        }
+        for (i, line) in source.chunks(stride).take(count).enumerate() {
+            for (j, (entry, input)) in line.iter().zip(inputs).enumerate() {
+                *self.at(row + i, column + j) = entry * input.residual;
+            }
+        }
     }
 
     /// Adds `factor` times `count` numbers, `stride` apart, to a column.
@@ -212,6 +228,51 @@ impl<'a> Target<'a> {
     }
 }
 
+/// Copies `[count, width]` numbers, each at least as many as a tile, which are in rows `stride` apart, to columns that are
+/// `apart`. Each column counts a factor, if there are some. Tile by tile, so that neither rows nor columns leave the
+/// nearest cache; the last ones overlap with those before them.
+struct Transpose<'a> {
+    to: &'a mut [f64],
+    apart: usize,
+    source: &'a [f64],
+    stride: usize,
+    size: [usize; 2],
+    factors: Option<&'a [InputImpulse]>,
+}
+
+impl InEights for Transpose<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<E: Eight>(self) {
+        let Self { to, apart, source, stride, size: [count, width], factors } = self;
+        let tiles =
+            |count: usize| (0..count).step_by(TILE).map(move |first| first.min(count - TILE));
+        for left in tiles(width) {
+            let mut of_columns = Block([1.0; TILE]);
+            if let Some(impulses) = factors {
+                let impulses = of_columns.0.iter_mut().zip(&impulses[left..]);
+                impulses.for_each(|(factor, impulse)| *factor = impulse.residual);
+            }
+            let of_columns = E::of(&of_columns);
+            for top in tiles(count) {
+                let mut rows = [E::ZERO; TILE];
+                for (i, row) in rows.iter_mut().enumerate() {
+                    *row = E::of_list(&source[(top + i) * stride + left..]);
+                }
+                if factors.is_some() {
+                    for row in &mut rows {
+                        *row = row.times(of_columns);
+                    }
+                }
+                for (j, column) in E::transposed(rows).iter().enumerate() {
+                    column.put_list(&mut to[(left + j) * apart + top..]);
+                }
+            }
+        }
+    }
+}
+
 /// What three inputs give to the residual of a ball joint, a column for each, where the list begins with these.
 fn of_ball(impulses: &[InputImpulse]) -> Option<Mat3> {
     let nine = impulses.first_chunk::<9>()?;
@@ -221,6 +282,13 @@ fn of_ball(impulses: &[InputImpulse]) -> Option<Mat3> {
     };
     let column = |k: usize| Vec3([0, 1, 2].map(|a| nine[k + a].residual));
     nine.iter().enumerate().all(is_in_place).then(|| Mat3([column(0), column(3), column(6)]))
+}
+
+/// Whether each input acts on one coordinate of its own, one after the other: then their columns are those of momenta.
+fn is_straight(impulses: &[InputImpulse]) -> bool {
+    impulses.windows(2).all(|pair| {
+        pair[1].input == pair[0].input + 1 && pair[1].coordinate == pair[0].coordinate + 1
+    })
 }
 
 impl Linearization {
@@ -276,6 +344,16 @@ impl Linearization {
         b.clear();
         if self.kind == Kind::Step {
             let mut rest = &self.ends.inputs[..];
+            if let Some(first) = rest.first().filter(|_| is_straight(rest)) {
+                let place = [first.coordinate, first.input];
+                for (rows, top) in [(&self.increment, 0), (&self.momentum, n)] {
+                    b.copy_times(&rows[n + place[0]..], stride, nd, rest, [top, place[1]]);
+                }
+                for InputImpulse { input, coordinate, residual, momentum } in rest {
+                    *b.at(n + coordinate, *input) += momentum - residual;
+                }
+                rest = &[];
+            }
             while let Some(impulse) = rest.first() {
                 let (column, input) = (n + impulse.coordinate, impulse.input);
                 let of_ball = of_ball(rest);

@@ -21,15 +21,15 @@ impl Plant {
         if !self.is_one_midpoint_step() || !is_generated(&self.model, &self.settings) {
             return self.differentiate_by_matrices(u, out);
         }
-        let mut report = self.solve(u, None)?;
+        self.solve(u, None)?;
         if self.period.is_reached {
             return self.differentiate_by_matrices(u, out);
         }
         let Self { model, settings, state, workspace, period } = self;
         let u = period.input.of_step(model, state, settings.time_step_s, u, [0.0, 1.0])?;
         workspace.differentiate(StepContext { model, settings, state, u }, out)?;
-        workspace.kkt.estimates.write(&mut report);
-        Ok(report)
+        workspace.kkt.estimates.write(&mut workspace.step.report);
+        Ok(workspace.step.report)
     }
 
     fn differentiate_by_matrices(

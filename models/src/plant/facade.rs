@@ -67,9 +67,9 @@ impl Plant {
     /// # Ok::<(), Box<dyn std::error::Error>>(())
     /// ```
     pub fn step(&mut self, u: &[f64]) -> Result<StepReport, StepError> {
-        let report = self.solve(u, None)?;
+        self.solve(u, None)?;
         self.commit();
-        Ok(report)
+        Ok(self.workspace.step.report)
     }
 
     /// Linearizes the map at the current state and `u`, and stays there. Costs a step, a
@@ -83,7 +83,8 @@ impl Plant {
         u: &[f64],
         out: &mut Linearization,
     ) -> Result<StepReport, StepError> {
-        self.solve(u, Some(out))
+        self.solve(u, Some(out))?;
+        Ok(self.workspace.step.report)
     }
 
     /// Takes one step and linearizes it at its solution.

@@ -40,7 +40,7 @@ impl Plant {
             self.state.p.copy_from_slice(&p0[..self.model.dimensions.dynamic]);
             self.state.p_low.fill(0.0);
             self.state.past.forget();
-            return self.solve(step.u, Some(out)).map(|_| ());
+            return self.solve(step.u, Some(out));
         }
         out.assert_model(&self.model);
         self.place_known(step)?;

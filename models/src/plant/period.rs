@@ -168,8 +168,8 @@ impl PreciseState {
             None => {
                 let inertia = &model.conditioning.inertia;
                 let Response { pushed, point, .. } = &workspace.response;
-                let StepIncrement { increment, evaluations, .. } = &workspace.step;
-                self.past.record(increment, inertia, pushed, *evaluations);
+                let StepIncrement { increment, report, .. } = &workspace.step;
+                self.past.record(increment, inertia, pushed, report.iterations);
                 self.past.point.follow(point);
             }
         }

@@ -10,13 +10,13 @@ use crate::plant::facade::Plant;
 use crate::plant::period::Period;
 
 impl Plant {
-    /// Solves the period, and linearizes it if asked to; stays where it is. The error is that of the
+    /// Solves the period, and linearizes it if asked to; stays where it is. The report is in the workspace. The error is that of the
     /// shortest steps.
     pub(crate) fn solve(
         &mut self,
         u: &[f64],
         mut out: Option<&mut Linearization>,
-    ) -> Result<StepReport, StepError> {
+    ) -> Result<(), StepError> {
         self.model.check_input(u)?;
         if let Some(out) = &out {
             out.assert_model(&self.model);
@@ -32,11 +32,12 @@ impl Plant {
                 self.workspace.forget();
             }
             match result {
-                Ok(report) => {
+                Ok(()) => {
                     self.period.halvings = halvings;
                     self.period.failed = failed;
-                    let halvings = u32::from(halvings);
-                    return Ok(StepReport { halvings, steps: report.steps.max(1), ..report });
+                    let report = &mut self.workspace.step.report;
+                    (report.halvings, report.steps) = (halvings.into(), report.steps.max(1));
+                    return Ok(());
                 }
                 Err(error) if halvings >= most || !error.may_be_too_long() => return Err(error),
                 Err(_) => failed = true,
@@ -61,7 +62,7 @@ impl Plant {
         u: &[f64],
         halvings: u8,
         mut out: Option<&mut Linearization>,
-    ) -> Result<StepReport, StepError> {
+    ) -> Result<(), StepError> {
         let Self { model, settings, state, workspace, period } = self;
         let model = &**model;
         let h = settings.time_step_s;
@@ -99,23 +100,23 @@ impl Plant {
             let u = input.of_step(model, state, h, u, [fraction, end])?;
             let at = StepContext { model, settings: &settings, state: reached, u };
             let start_s = state.time_after_s(fraction, h);
-            let part_report = match out.as_deref_mut() {
+            match out.as_deref_mut() {
                 None => take(workspace, collocation, at, start_s, None)?,
                 Some(out) => {
                     let part = chain.next_part(model, out, fraction, end);
-                    let report = take(workspace, collocation, at, start_s, Some(part))?;
+                    take(workspace, collocation, at, start_s, Some(part))?;
                     chain.go_on(out);
-                    report
                 }
-            };
+            }
             period.advance(model, workspace);
-            report.add(&part_report);
+            report.add(&workspace.step.report);
         }
         period.reached.multipliers.copy_from_slice(&period.multipliers);
         if let Some(out) = out {
             period.chain.finish(h, out);
         }
-        Ok(report)
+        workspace.step.report = report;
+        Ok(())
     }
 
     /// Moves on to the solution.
@@ -135,7 +136,7 @@ impl Plant {
     }
 }
 
-/// Takes a step and linearizes it if asked to; the solution is in the workspace.
+/// Takes a step and linearizes it if asked to; the solution is in the workspace, with its report.
 #[inline]
 pub(crate) fn take(
     workspace: &mut Workspace,
@@ -143,20 +144,20 @@ pub(crate) fn take(
     at: StepContext<'_>,
     start_s: f64,
     out: Option<&mut Linearization>,
-) -> Result<StepReport, StepError> {
+) -> Result<(), StepError> {
     let Some(collocation) = collocation else {
-        let mut report = workspace.solve(at)?;
+        workspace.solve(at)?;
         if let Some(out) = out {
             workspace.linearize(at, out)?;
-            workspace.kkt.estimates.write(&mut report);
+            workspace.kkt.estimates.write(&mut workspace.step.report);
         }
-        return Ok(report);
+        return Ok(());
     };
-    let report = collocation.solve(workspace, at, start_s)?;
+    collocation.solve(workspace, at, start_s)?;
     if let Some(out) = out {
         collocation.linearize(workspace, at, out)?;
     }
-    Ok(report)
+    Ok(())
 }
 
 /// Periods that must go well before fewer steps are tried.
