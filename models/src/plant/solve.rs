@@ -10,8 +10,8 @@ use crate::plant::facade::Plant;
 use crate::plant::period::Period;
 
 impl Plant {
-    /// Solves the period, and linearizes it if asked to; stays where it is. The report is in the workspace. The error is that of the
-    /// shortest steps.
+    /// Solves the period, and linearizes it if asked to; stays where it is. The report is in the workspace. The
+    /// error is that of the shortest steps.
     pub(crate) fn solve(
         &mut self,
         u: &[f64],
