@@ -98,8 +98,8 @@ impl Collocation {
         }
     }
 
-    /// Solves one step, which starts at a time; the solution stays here and in the workspace, with its report. `u` has no
-    /// signals of inputs.
+    /// Solves one step, which starts at a time; the solution stays here and in the workspace, with its report. `u` has
+    /// no signals of inputs.
     pub(crate) fn solve(
         &mut self,
         workspace: &mut Workspace,

@@ -228,9 +228,9 @@ impl<'a> Target<'a> {
     }
 }
 
-/// Copies `[count, width]` numbers, each at least as many as a tile, which are in rows `stride` apart, to columns that are
-/// `apart`. Each column counts a factor, if there are some. Tile by tile, so that neither rows nor columns leave the
-/// nearest cache; the last ones overlap with those before them.
+/// Copies `[count, width]` numbers, each at least as many as a tile, which are in rows `stride` apart, to columns that
+/// are `apart`. Each column counts a factor, if there are some. Tile by tile, so that neither rows nor columns leave
+/// the nearest cache; the last ones overlap with those before them.
 struct Transpose<'a> {
     to: &'a mut [f64],
     apart: usize,
