@@ -4,7 +4,8 @@ use crate::common::linearization::{check, check_with, check_within};
 use plantd_models::Model;
 
 use crate::common::{
-    ACROSS, MOVED_BALL, PUSHES, builtin, floating, methods, pulled_rope, random_tree,
+    ACROSS, BRAKES, MOVED_BALL, PUSHES, braced_rope, builtin, floating, methods, pulled_rope,
+    random_tree,
 };
 
 #[test]
@@ -46,10 +47,22 @@ fn ropes_that_are_pulled_from_the_world() {
     for more in ["", PUSHES, MOVED_BALL, ACROSS] {
         let scene = pulled_rope(more);
         let plan = Model::compile(&scene).unwrap().plan();
-        assert!(plan.contains("by generators, with what acts from the world"), "{plan}");
+        assert!(plan.contains("by generators, with what acts at poses"), "{plan}");
         check_within(&scene, 0.3);
     }
     check_with(&pulled_rope(PUSHES), |s| s.order = 4);
+}
+
+/// What acts across several joints of a long chain; with dampers it is stepped entry by entry, and only products go by
+/// generators.
+#[test]
+fn ropes_that_are_braced() {
+    for (more, is_generated) in [("", true), (MOVED_BALL, true), (BRAKES, false)] {
+        let scene = braced_rope(more);
+        let plan = Model::compile(&scene).unwrap().plan();
+        assert_eq!(plan.contains("by generators, with what acts at poses"), is_generated, "{plan}");
+        check_within(&scene, 0.1);
+    }
 }
 
 /// Higher orders and substeps: collocation with forces, prescribed joints and constraints.

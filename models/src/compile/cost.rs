@@ -4,7 +4,7 @@
 //! sums are right to a factor of two, which the tests of the instruction counts hold them to.
 
 use crate::integrator::settings::Settings;
-use crate::model::mechanism::{ConstraintKind, Forces, Model, Solver};
+use crate::model::mechanism::{Blocks, ConstraintKind, Forces, Model, Solver};
 use crate::model::tree::{Rotational, Tree};
 
 /// A part of a step of the midpoint rule, or of its linearization.
@@ -48,10 +48,14 @@ impl Model {
             }
             Solver::Planar => (100.0 + 340.0 * joints, 110.0 + 88.0 * joints),
             Solver::Loops => (5.0 * fronts, 41.0 * rows),
-            Solver::Spatial if self.has_fields() => {
-                (100.0 + 4300.0 * joints, 110.0 + 170.0 * joints)
+            Solver::Spatial => {
+                let (factorization, correction) = match self.blocks() {
+                    Blocks::One => (1350.0, 93.0),
+                    Blocks::Two => (4300.0, 170.0),
+                    Blocks::Three => (9200.0, 247.0),
+                };
+                (100.0 + factorization * joints, 110.0 + correction * joints)
             }
-            Solver::Spatial => (100.0 + 1350.0 * joints, 110.0 + 93.0 * joints),
         };
         let schur = 800.0 + 165.0 * nd * nc + 2.0 * nc.powi(3);
         let jacobian = 71.0 * support.iter().sum::<f64>();

@@ -79,7 +79,7 @@ impl Model {
             }
             Solver::Planar | Solver::Spatial => {
                 let fields = if self.solver == Solver::Spatial && self.has_fields() {
-                    ", with what acts from the world"
+                    ", with what acts at poses"
                 } else {
                     ""
                 };

@@ -15,9 +15,9 @@ use crate::compile::pattern::{couplings, joint_pairs};
 use crate::compile::{inertia, pattern, settling};
 use crate::model::conditioning::Conditioning;
 use crate::model::mechanism::{
-    Alignment, AlongAxis, Armature, Carries, Constraint, ConstraintKind, Coordinate, Coupling,
-    Dimensions, Forces, Length, Model, Mover, OperatingPoint, PathJoint, PathLength, PointDistance,
-    PointPair, Polynomial, Product, Solver, Vector,
+    Alignment, AlongAxis, Armature, Blocks, Carries, Constraint, ConstraintKind, Coordinate,
+    Coupling, Dimensions, Forces, Length, Model, Mover, OperatingPoint, PathJoint, PathLength,
+    PointDistance, PointPair, Polynomial, Product, Solver, Vector,
 };
 use crate::model::planar_tree::{crooked, planar};
 use crate::model::site::Site;
@@ -119,9 +119,10 @@ fn assemble(scene: &Scene, layout: Layout) -> Model {
     let is_moved = dynamics.joints.iter().any(|joint| joint.coordinate >= dynamic);
     let is_free = dimensions.constraints == 0;
     let goes_to_space =
-        needs_poses || (is_moved && is_free && Solver::is_deep(&elimination, false));
+        needs_poses || (is_moved && is_free && Solver::is_deep(&elimination, Blocks::One));
     let planar = if goes_to_space { None } else { planar(&dynamics, gravity) };
     let mut model = Model {
+        field_ends: None,
         conditioning: Conditioning::default(),
         initial_violations: Vec::new(),
         dimensions,
@@ -152,6 +153,7 @@ fn assemble(scene: &Scene, layout: Layout) -> Model {
         scene: scene.clone(),
         warnings: Vec::new(),
     };
+    model.field_ends = model.find_field_ends();
     model.solver = Solver::of(&model);
     model.initial_violations = model.violations_at_start();
     model.conditioning = Conditioning::new(&model);

@@ -16,8 +16,9 @@
 //! ```
 //!
 //! as in [`planar`](crate::kkt::planar), from the leaves to the root; the pivots are those of an elimination axis
-//! by axis. A joint whose motion is prescribed is passed by: `A` goes on to its parent as it is. Each step up the
-//! tree waits for the one before, so it counts how many there are. As all sums are about one origin, the solution
+//! by axis. A joint whose motion is prescribed is passed by: `A` goes on to its parent as it is. Where what acts on
+//! bodies ends, at a body that it acts from, `A` goes on with the first block of its rows and columns alone, and so do
+//! the flows of right-hand sides. Each step up the tree waits for the one before, so it counts how many there are. As all sums are about one origin, the solution
 //! loses digits in long chains (up to 1e-11 of it in one of 64 hinges), which the next correction makes good.
 
 pub(crate) mod columns;
@@ -41,7 +42,7 @@ use crate::lagrangian::curvature::Curvature;
 use crate::lagrangian::fields::Fields;
 use crate::lagrangian::generators::{Generators, MatrixKind, Step};
 use crate::lagrangian::turning::Weights;
-use crate::model::mechanism::Model;
+use crate::model::mechanism::{Blocks, Model};
 use crate::model::tree::{JointKind, Tree};
 
 /// Axes that are eliminated at once, at most.
@@ -56,7 +57,7 @@ pub(crate) struct Added<'a> {
     /// On the diagonal, but for ball joints.
     pub(crate) diagonal: &'a [f64],
     pub(crate) balls: &'a [Weights],
-    /// By what acts on bodies from the world.
+    /// By what acts on bodies from the world, or from bodies above.
     pub(crate) fields: Option<&'a Fields>,
 }
 
@@ -69,6 +70,8 @@ struct Group {
     rows: Range<usize>,
     /// Where dynamic and prescribed coordinates of the axes, and of all that is below them, are.
     reach: [Range<usize>; 2],
+    /// Whether what acts on bodies, which vectors have more blocks for, ends above the axes.
+    is_end: bool,
 }
 
 /// What axes are eliminated together.
@@ -101,8 +104,7 @@ struct Fork {
     is_first: bool,
 }
 
-/// The Newton matrix of a tree in space, factored. Vectors have `B` blocks: one, or two where something acts on bodies
-/// from the world.
+/// The Newton matrix of a tree in space, factored. Vectors have `B` blocks ([`Model::blocks`]).
 #[derive(Clone, Debug)]
 pub(crate) struct SpatialRecursion<const B: usize> {
     /// In the order of their elimination, as are groups.
@@ -125,15 +127,17 @@ type Kept<const B: usize> = [[[Line<B>; 8]; B]; 2];
 /// The recursion that a model needs.
 #[derive(Clone, Debug)]
 pub(crate) enum Spatial {
-    OfBodies(SpatialRecursion<1>),
-    WithFields(SpatialRecursion<2>),
+    One(SpatialRecursion<1>),
+    Two(SpatialRecursion<2>),
+    Three(SpatialRecursion<3>),
 }
 
 impl Spatial {
     pub(crate) fn new(model: &Model) -> Self {
-        match model.has_fields() {
-            false => Self::OfBodies(SpatialRecursion::new(model)),
-            true => Self::WithFields(SpatialRecursion::new(model)),
+        match model.blocks() {
+            Blocks::One => Self::One(SpatialRecursion::new(model)),
+            Blocks::Two => Self::Two(SpatialRecursion::new(model)),
+            Blocks::Three => Self::Three(SpatialRecursion::new(model)),
         }
     }
 
@@ -147,16 +151,18 @@ impl Spatial {
     ) -> SmallestPivot {
         let vectors = Vectors { curvature, added, step: Step::new(time_step_s, kind) };
         match self {
-            Self::OfBodies(recursion) => recursion.factor(model, vectors),
-            Self::WithFields(recursion) => recursion.factor(model, vectors),
+            Self::One(recursion) => recursion.factor(model, vectors),
+            Self::Two(recursion) => recursion.factor(model, vectors),
+            Self::Three(recursion) => recursion.factor(model, vectors),
         }
     }
 
     /// Solves `K x = b` in place.
     pub(crate) fn solve(&mut self, x: &mut [f64]) {
         match self {
-            Self::OfBodies(recursion) => recursion.solve(x),
-            Self::WithFields(recursion) => recursion.solve(x),
+            Self::One(recursion) => recursion.solve(x),
+            Self::Two(recursion) => recursion.solve(x),
+            Self::Three(recursion) => recursion.solve(x),
         }
     }
 }
@@ -195,6 +201,18 @@ impl<E: Eight, const B: usize> Sums<E, B> {
             }
         }
         self
+    }
+
+    /// Leaves the first block alone.
+    #[inline(always)]
+    fn end(&mut self) {
+        for sums in [&mut self.rows, &mut self.columns] {
+            for (b, lines) in sums.iter_mut().enumerate() {
+                for line in lines {
+                    *line = if b == 0 { line.ended() } else { InLine::ZERO };
+                }
+            }
+        }
     }
 
     #[inline(always)]
@@ -251,7 +269,7 @@ fn inverse<const W: usize>(d: &[[f64; W]; W]) -> ([[f64; W]; W], [f64; W]) {
 }
 
 /// Limbs and groups in the order of their elimination, and how many places of sums there are.
-fn limbs(tree: &Tree, nd: usize) -> (Vec<Limb>, Vec<Group>, usize) {
+fn limbs(tree: &Tree, nd: usize, field_ends: &[bool]) -> (Vec<Limb>, Vec<Group>, usize) {
     let joints = &tree.joints[..];
     let mut children = vec![0; joints.len()];
     // Behind the last axis below each.
@@ -285,7 +303,7 @@ fn limbs(tree: &Tree, nd: usize) -> (Vec<Limb>, Vec<Group>, usize) {
         }
         let parent = joints[top].parent;
         let begin = groups.len();
-        gather(tree, top..end, nd, &mut groups);
+        gather(tree, top..end, (nd, field_ends), &mut groups);
         for group in &mut groups[begin..] {
             for joint in &joints[group.axes.start..ends[lowest]] {
                 let i = joint.coordinate;
@@ -310,7 +328,13 @@ fn limbs(tree: &Tree, nd: usize) -> (Vec<Limb>, Vec<Group>, usize) {
 }
 
 /// Groups of axes one below the other, the lowest first; as few as can be, and of like sizes.
-fn gather(tree: &Tree, axes: Range<usize>, nd: usize, groups: &mut Vec<Group>) {
+fn gather(
+    tree: &Tree,
+    axes: Range<usize>,
+    (nd, field_ends): (usize, &[bool]),
+    groups: &mut Vec<Group>,
+) {
+    let ends = |i: usize| field_ends.get(i).is_some_and(|is_end| *is_end);
     let kind = |i: usize| {
         let joint = &tree.joints[i];
         let ball = matches!(joint.kind, JointKind::Ball(_)).then_some(joint.orientation);
@@ -323,7 +347,8 @@ fn gather(tree: &Tree, axes: Range<usize>, nd: usize, groups: &mut Vec<Group>) {
     let mut push = |axes: Range<usize>, kind| {
         let first = tree.joints[axes.start].coordinate;
         let rows = first..first + axes.len();
-        groups.push(Group { axes, kind, rows, reach: [0..0, 0..0] });
+        let is_end = ends(axes.start);
+        groups.push(Group { axes, kind, rows, reach: [0..0, 0..0], is_end });
     };
     let mut end = axes.end;
     while end > axes.start {
@@ -332,8 +357,9 @@ fn gather(tree: &Tree, axes: Range<usize>, nd: usize, groups: &mut Vec<Group>) {
             GroupKind::Ball(_) | GroupKind::Prescribed(Some(_)) => end - 3,
             GroupKind::Prescribed(None) => end - 1,
             GroupKind::Single => {
-                let others = (axes.start..end).rev().find(|i| kind(*i) != own);
-                others.map_or(axes.start, |i| i + 1)
+                let mut starts = (axes.start..end).rev();
+                let top = |i: &usize| *i == axes.start || ends(*i) || kind(*i - 1) != own;
+                starts.find(top).unwrap_or(axes.start)
             }
         };
         for left in (1..=(end - start).div_ceil(WIDEST)).rev() {
@@ -347,7 +373,8 @@ fn gather(tree: &Tree, axes: Range<usize>, nd: usize, groups: &mut Vec<Group>) {
 impl<const B: usize> SpatialRecursion<B> {
     pub(crate) fn new(model: &Model) -> Self {
         let joints = model.dynamics.joints.len();
-        let (limbs, groups, places) = limbs(&model.dynamics, model.dimensions.dynamic);
+        let field_ends = model.field_ends.as_deref().unwrap_or_default();
+        let (limbs, groups, places) = limbs(&model.dynamics, model.dimensions.dynamic, field_ends);
         Self {
             within: vec![[[0.0; WIDEST]; WIDEST]; groups.len()],
             limbs,
@@ -361,7 +388,7 @@ impl<const B: usize> SpatialRecursion<B> {
     /// Factors the matrix that belongs to the last second derivatives; dynamic joints are in the order of their
     /// coordinates. Each pivot is compared with the larger of its diagonal entry
     /// and the inertia of its row over the step. Of masses alone it is `−M/h`. About 600 flops an axis, or 2000 with
-    /// two blocks.
+    /// two blocks and 4400 with three.
     #[inline(never)]
     fn factor(&mut self, model: &Model, vectors: Vectors<'_>) -> SmallestPivot {
         let inertia = &model.conditioning.inertia[..];
@@ -486,17 +513,19 @@ impl<const B: usize> SpatialRecursion<B> {
                 let is_root = limb.hangs_from.is_none() && at + 1 == limb.groups.end;
                 let axes = &self.axes[group.axes.clone()];
                 watch.see(at, group, axes, carries.then_some(&sums));
-                if matches!(group.kind, GroupKind::Prescribed(_)) {
-                    continue;
+                if !matches!(group.kind, GroupKind::Prescribed(_)) {
+                    let sums = &mut sums;
+                    match &mut self.axes[group.axes.clone()] {
+                        [a] => eliminate([a], within, sums, carries, is_root, see),
+                        [a, b] => eliminate([a, b], within, sums, carries, is_root, see),
+                        [a, b, c] => eliminate([a, b, c], within, sums, carries, is_root, see),
+                        _ => {}
+                    }
+                    carries = true;
                 }
-                let sums = &mut sums;
-                match &mut self.axes[group.axes.clone()] {
-                    [a] => eliminate([a], within, sums, carries, is_root, see),
-                    [a, b] => eliminate([a, b], within, sums, carries, is_root, see),
-                    [a, b, c] => eliminate([a, b, c], within, sums, carries, is_root, see),
-                    _ => {}
+                if B > 1 && group.is_end {
+                    sums.end();
                 }
-                carries = true;
             }
             if let Some(Fork { place, is_first }) = limb.hangs_from {
                 let all = &mut self.sums[place];
@@ -627,7 +656,11 @@ impl Limbs<'_> {
                 None => InLine::ZERO,
             };
             for at in limb.groups.clone() {
-                flow = through.pass(at, &self.groups[at], flow);
+                let group = &self.groups[at];
+                flow = through.pass(at, group, flow);
+                if B > 1 && group.is_end {
+                    flow = flow.ended();
+                }
             }
             if let Some(Fork { place, is_first }) = limb.hangs_from {
                 let all = &mut flows[place];
@@ -650,7 +683,11 @@ impl Limbs<'_> {
                 None => InLine::ZERO,
             };
             for at in limb.groups.clone().rev() {
-                flow = through.pass(at, &self.groups[at], flow);
+                let group = &self.groups[at];
+                if B > 1 && group.is_end {
+                    flow = flow.ended();
+                }
+                flow = through.pass(at, group, flow);
             }
             if let Some(place) = limb.carries {
                 flow.put(&mut flows[place]);

@@ -1,5 +1,5 @@
-//! What acts on a body at a pose, from the world, to the second derivatives: springs, dampers and drag between a
-//! point and the world, and wrenches.
+//! What acts on a body at a pose, from the world or from a body above it, to the second derivatives: springs, dampers
+//! and drag between two points, along paths between two bodies, and wrenches.
 //!
 //! Such an element exerts a wrench `W(q, v)` on its body. With the axis `J_j` of a joint above the body and its rate
 //! `J̇_j`, about the origin of the tree,
@@ -19,6 +19,11 @@
 //! so that a spring on a long chain does not fill the Newton matrix: see
 //! [`generators`](crate::lagrangian::generators). Two axes of one ball joint turn with it: for both orders the second
 //! line holds.
+//!
+//! What acts from a body above acts on that one too, and nothing of it changes with the joints above both, which
+//! feel nothing of it. Between the bodies it is as if from the world, so sums end above the joint that hangs from
+//! the upper one. One set of vectors for each joint has no more than one such end for all elements that a joint is
+//! between ([`Model::find_field_ends`]); others are for matrices that are filled entry by entry.
 
 use plantd_math::eights::{Eight, InEights, in_eights};
 use plantd_math::rows::Block;
@@ -26,7 +31,9 @@ use plantd_math::spatial::{Force, Mat3, Motion, Vec3};
 
 use crate::lagrangian::instant::Instant;
 use crate::lagrangian::momenta::Momenta;
-use crate::model::mechanism::{Forces, Model, Potentials, Spring, mover};
+use crate::model::mechanism::{
+    Blocks, Forces, Model, PointPair, Potentials, Span, Spring, mover, span,
+};
 use crate::model::tree::{Tree, WORLD};
 
 /// Takes a wrench, and its change with the motion of the body `(J, J̇)`.
@@ -34,10 +41,15 @@ pub(crate) type Take<'a> = &'a mut dyn FnMut(Force, &dyn Fn(Motion, Motion) -> F
 
 /// The wrench of an element on its body, and how it changes.
 pub(crate) trait Field {
-    /// The joint that carries the body.
-    fn joint(&self) -> usize;
+    /// The body, and what the element acts from.
+    fn span(&self) -> Option<Span>;
 
-    /// Gives the wrench and its change.
+    /// Whether it changes with velocities.
+    fn has_rates(&self) -> bool {
+        false
+    }
+
+    /// Gives the wrench and its change, maybe in parts.
     fn exert(&self, at: &Instant<'_>, take: Take<'_>);
 }
 
@@ -129,16 +141,47 @@ impl OwnTorque {
 }
 
 impl Model {
-    /// What acts on bodies from the world, at their poses, but what acts across one joint; and what each counts, where
-    /// forces count `weight` times.
-    fn fields(&self, weight: f64) -> impl Iterator<Item = (&dyn Field, f64)> {
+    /// What acts on bodies from the world or bodies above, at their poses, but what acts across one joint; and what
+    /// each counts, where forces count `weight` times.
+    fn fields(&self, weight: f64) -> impl Iterator<Item = (Span, &dyn Field, f64)> {
         let springs = self.potentials.fields().map(|field| (field, 1.0));
-        springs.chain(self.forces.iter().flat_map(Forces::fields).map(move |field| (field, weight)))
+        let forces = self.forces.iter().flat_map(Forces::fields).map(move |field| (field, weight));
+        springs.chain(forces).filter_map(|(field, weight)| Some((field.span()?, field, weight)))
     }
 
     /// Whether something does.
     pub(crate) fn has_fields(&self) -> bool {
         self.fields(1.0).next().is_some()
+    }
+
+    /// How many blocks the vectors of its joints have.
+    pub(crate) fn blocks(&self) -> Blocks {
+        let follows =
+            |(span, field, _): (Span, &dyn Field, f64)| field.has_rates() && span.base != WORLD;
+        match self.fields(1.0).any(follows) {
+            true => Blocks::Three,
+            false if self.has_fields() => Blocks::Two,
+            false => Blocks::One,
+        }
+    }
+
+    /// [`Model::field_ends`].
+    pub(crate) fn find_field_ends(&self) -> Option<Vec<bool>> {
+        let joints = &self.dynamics.joints[..];
+        let mut bases = vec![None; joints.len()];
+        for (Span { body, base }, ..) in self.fields(1.0) {
+            let mut at = body;
+            // Above a joint that is between the same base and another body, all have been there.
+            while at != base && bases[at] != Some(base) {
+                if bases[at].replace(base).is_some() {
+                    return None;
+                }
+                at = joints[at].parent;
+            }
+        }
+        let ends = joints.iter().zip(bases);
+        let ends = ends.map(|(joint, base)| joint.parent != WORLD && base == Some(joint.parent));
+        Some(ends.collect())
     }
 }
 
@@ -146,6 +189,7 @@ impl Potentials {
     fn fields(&self) -> impl Iterator<Item = &dyn Field> {
         self.springs.iter().filter_map(|spring| match spring {
             Spring::Point(spring) if spring.ends.mover.is_none() => Some(spring as &dyn Field),
+            Spring::Path(spring) if mover(&spring.segments).is_none() => Some(spring as &dyn Field),
             _ => None,
         })
     }
@@ -155,15 +199,20 @@ impl Forces {
     fn fields(&self) -> impl Iterator<Item = &dyn Field> {
         let wrenches = self.wrenches.iter().map(|wrench| wrench as &dyn Field);
         let at_points = self.point_forces.iter().filter(|force| force.ends.mover.is_none());
-        wrenches.chain(at_points.map(|force| force as &dyn Field))
+        let along = self.path_forces.iter().filter(|force| mover(&force.segments).is_none());
+        wrenches
+            .chain(at_points.map(|force| force as &dyn Field))
+            .chain(along.map(|force| force as &dyn Field))
     }
 
-    /// Whether all act on bodies from the world or on one joint, and none couple more.
+    /// Whether all act on bodies from the world or one above, or on one joint, and none couple more.
     pub(crate) fn are_generated(&self) -> bool {
         let Self { linear_dampers, path_forces, point_forces, .. } = self;
+        let are_along = |segments: &[_]| mover(segments).is_some() || span(segments).is_some();
+        let are_at = |ends: &PointPair| ends.mover.is_some() || ends.span().is_some();
         linear_dampers.is_empty()
-            && path_forces.iter().all(|force| mover(&force.segments).is_some())
-            && point_forces.iter().all(|force| force.ends.is_moved_alone())
+            && path_forces.iter().all(|force| are_along(&force.segments))
+            && point_forces.iter().all(|force| are_at(&force.ends))
     }
 }
 
@@ -171,7 +220,7 @@ impl Fields {
     pub(crate) fn new(model: &Model) -> Self {
         let joints = &model.dynamics.joints[..];
         let mut places = vec![NOWHERE; joints.len()];
-        let acted_on = model.fields(1.0).map(|(field, _)| field.joint());
+        let acted_on = model.fields(1.0).map(|(Span { body, .. }, ..)| body);
         let apart = joints.iter().enumerate().filter(|(i, joint)| !joint.follows(*i));
         let (mut count, parents) = (0, apart.map(|(_, joint)| joint.parent));
         for joint in acted_on.chain(parents) {
@@ -181,15 +230,15 @@ impl Fields {
             }
         }
         let given = vec![Given::default(); joints.len()];
-        let has_rates = model.forces.as_ref().is_some_and(|forces| !forces.point_forces.is_empty());
+        let has_rates = model.fields(1.0).any(|(_, field, _)| field.has_rates());
         Self { sums: vec![Sum::default(); count], places, given, has_rates }
     }
 
     /// Finds what joints give; forces count `weight` times.
     pub(crate) fn evaluate(&mut self, model: &Model, at: &Instant<'_>, weight: f64) {
         self.sums.fill(Sum::default());
-        for (field, weight) in model.fields(weight) {
-            let place = self.places.get(field.joint()).copied().unwrap_or(NOWHERE);
+        for (Span { body, .. }, field, weight) in model.fields(weight) {
+            let place = self.places.get(body).copied().unwrap_or(NOWHERE);
             let Some(sum) = self.sums.get_mut(place) else { continue };
             let scaled = |Force { n, f }: Force| Force { n: n * weight, f: f * weight };
             field.exert(at, &mut |wrench, change| {
@@ -204,7 +253,8 @@ impl Fields {
                 }
             });
         }
-        in_eights(Gather { fields: self, at });
+        let ends = model.field_ends.as_deref().unwrap_or_default();
+        in_eights(Gather { fields: self, ends, at });
     }
 
     /// What the axes of a ball joint that begin with `first` have among themselves.
@@ -223,6 +273,7 @@ impl Fields {
 /// What [`Fields::evaluate`] does once each body has what acts on it.
 struct Gather<'a> {
     fields: &'a mut Fields,
+    ends: &'a [bool],
     at: &'a Instant<'a>,
 }
 
@@ -231,7 +282,7 @@ impl InEights for Gather<'_> {
 
     #[inline(always)]
     fn run<E: Eight>(self) {
-        let Self { fields: Fields { sums, places, given, has_rates }, at } = self;
+        let Self { fields: Fields { sums, places, given, has_rates }, ends, at } = self;
         let mut sum = Sum::default();
         for (i, joint) in at.tree.joints.iter().enumerate().rev() {
             if let Some(own) = sums.get(places[i]) {
@@ -250,10 +301,11 @@ impl InEights for Gather<'_> {
                 combined::<E>(&by_rate[1], axis).put(&mut given.back);
             }
             pull.put(&mut given.pull);
-            if !joint.follows(i) {
-                if joint.parent != WORLD {
-                    sums[places[joint.parent]].add::<E>(&sum);
-                }
+            let is_end = ends[i];
+            if !is_end && !joint.follows(i) && joint.parent != WORLD {
+                sums[places[joint.parent]].add::<E>(&sum);
+            }
+            if is_end || !joint.follows(i) {
                 sum = Sum::default();
             }
         }

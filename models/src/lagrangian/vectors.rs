@@ -8,7 +8,7 @@ use plantd_math::spatial::Vec3;
 
 use crate::lagrangian::kinematics::Poses;
 use crate::model::mechanism::{Carries, PathJoint, PointPair, Product, Vector};
-use crate::model::tree::{Tree, WORLD};
+use crate::model::tree::{Attachment, Tree, WORLD};
 
 /// `a − b` in world axes, and both points relative to the origins of their trees.
 #[derive(Clone, Copy, Debug)]
@@ -160,6 +160,48 @@ impl<'a, S: Scalar> Distance<'a, S> {
             seconds.map(|second| across * self.inverse + self.direction.dot(second))
         };
         self.pair.for_each_pair((self.tree, self.poses, &self.at), value, entry);
+    }
+}
+
+/// The end of a segment that all joints between its points carry.
+pub(crate) struct MovingEnd<'a> {
+    pub(crate) of: &'a Attachment,
+    pub(crate) point: Vec3,
+    /// The other end.
+    pub(crate) base: &'a Attachment,
+    pub(crate) base_point: Vec3,
+    /// From the other end to this one, of length 1, or zero where they coincide.
+    pub(crate) along: Vec3,
+    inverse: f64,
+}
+
+/// Those of the segments of a path whose lengths change.
+pub(crate) fn moving_ends<'a>(
+    segments: &'a [PointPair],
+    tree: &'a Tree,
+    poses: &'a Poses,
+) -> impl Iterator<Item = MovingEnd<'a>> {
+    segments.iter().filter_map(|pair| {
+        let (of, carries) = pair.moving_end()?;
+        let Distance { at: Separation { a, b, .. }, direction, inverse, .. } =
+            Distance::new(pair, tree, poses);
+        Some(match carries {
+            Carries::A => {
+                let (base, along) = (&pair.b, direction);
+                MovingEnd { of, point: a, base, base_point: b, along, inverse }
+            }
+            _ => {
+                let (base, along) = (&pair.a, -direction);
+                MovingEnd { of, point: b, base, base_point: a, along, inverse }
+            }
+        })
+    })
+}
+
+impl MovingEnd<'_> {
+    /// How `along` turns as the end moves.
+    pub(crate) fn turned(&self, moved: Vec3) -> Vec3 {
+        (moved - self.along * self.along.dot(moved)) * self.inverse
     }
 }
 

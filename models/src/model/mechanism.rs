@@ -10,7 +10,7 @@ use crate::model::held::Held;
 use crate::model::loop_plan::Loops;
 use crate::model::planar_tree::PlanarJoints;
 use crate::model::signal::{Signal, Target};
-use crate::model::tree::{Attachment, Tree, WORLD};
+use crate::model::tree::{Attachment, Tree};
 
 /// A compiled scene: immutable, shared by all plants made from it.
 #[derive(Debug)]
@@ -57,6 +57,10 @@ pub struct Model {
     pub(crate) pairs: Vec<Pair>,
     /// Ancestor and descendant pairs of which exactly one is prescribed.
     pub(crate) mixed_pairs: Vec<MixedPair>,
+    /// Of each joint, whether what acts on bodies that it carries ends above it, at what it hangs from
+    /// ([`fields`](crate::lagrangian::fields)). `None` where the joints between two bodies are among those between two
+    /// others, or below the world and another one.
+    pub(crate) field_ends: Option<Vec<bool>>,
     /// What pivots are compared with.
     pub(crate) conditioning: Conditioning,
     pub(crate) initial_violations: Vec<Violation>,
@@ -85,6 +89,17 @@ pub(crate) enum Solver {
     Loops,
 }
 
+/// How many blocks the vectors of joints in space have.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Blocks {
+    /// Those of bodies.
+    One,
+    /// And of what acts on bodies from the world or from bodies above.
+    Two,
+    /// And of what does so from bodies above, and follows velocities.
+    Three,
+}
+
 impl Solver {
     /// Coordinates from which on generators are faster in planes.
     const MANY: usize = 4;
@@ -100,19 +115,27 @@ impl Solver {
     /// Many axes one below the other are for generators. Where not much is at stake, entries it is: plants
     /// that are solved entry by entry can go side by side.
     const DEEP: usize = 6;
-    /// The same where something acts on bodies from the world, and vectors are twice as long:
+    /// The same where something acts on bodies from the world or from bodies above, and vectors are twice as long:
     ///
     /// ```text
     /// quadruped with a push, of 6.5 entries       1.0 to 1.3
     /// rope of 16 with a spring, of 8.5            0.8
     /// humanoid with a push, of 9.7 entries        0.9 to 1.1, with drag on a hand 0.55
     /// rope of 24, 32, 64 and 128 with a spring    0.58, 0.47, 0.22, 0.10
+    /// the same, between two of its bodies         1.04, 0.86, 0.46, 0.19
     /// ```
     const DEEP_WITH_FIELDS: usize = 8;
+    /// And where they are three times as long: a rope of 24, 32, 64 and 128 with a damper between two of its bodies took
+    /// 1.47, 1.21, 0.67 and 0.27.
+    const DEEP_WITH_RATES: usize = 18;
 
-    /// Whether generators are faster in space.
-    pub(crate) fn is_deep(elimination: &SymbolicElimination, has_fields: bool) -> bool {
-        let least = if has_fields { Self::DEEP_WITH_FIELDS } else { Self::DEEP };
+    /// Whether generators of so many blocks are faster in space.
+    pub(crate) fn is_deep(elimination: &SymbolicElimination, blocks: Blocks) -> bool {
+        let least = match blocks {
+            Blocks::One => Self::DEEP,
+            Blocks::Two => Self::DEEP_WITH_FIELDS,
+            Blocks::Three => Self::DEEP_WITH_RATES,
+        };
         elimination.entries() > least * elimination.rows()
     }
 
@@ -120,7 +143,7 @@ impl Solver {
     pub(crate) fn of(model: &Model) -> Self {
         let d = model.dimensions;
         if model.is_generated_in_space() {
-            let is_deep = Self::is_deep(&model.elimination, model.has_fields());
+            let is_deep = Self::is_deep(&model.elimination, model.blocks());
             return if is_deep { Self::Spatial } else { Self::Tree };
         }
         let is_free = d.constraints == 0 && d.prescribed == 0 && model.joints_are_in_order();
@@ -197,13 +220,15 @@ impl Spring {
 }
 
 impl Spring {
-    /// Whether it acts on one coordinate, on one joint, or on a body from the world.
+    /// Whether it acts on one coordinate, on one joint, or on a body from the world or one above it.
     fn is_generated(&self) -> bool {
         match self {
             Self::Coordinate(_) | Self::Spline(_) | Self::Stop(_) | Self::Orientation(_) => true,
-            Self::Point(spring) => spring.ends.is_moved_alone(),
+            Self::Point(spring) => spring.ends.mover.is_some() || spring.ends.span().is_some(),
             Self::Linear(_) => !self.couples_branches(),
-            Self::Path(spring) => mover(&spring.segments).is_some(),
+            Self::Path(spring) => {
+                mover(&spring.segments).is_some() || span(&spring.segments).is_some()
+            }
         }
     }
 
@@ -473,9 +498,31 @@ pub(crate) enum Mover {
 
 /// The one that moves all points of a path.
 pub(crate) fn mover(segments: &[PointPair]) -> Option<Mover> {
-    let mut movers = segments.iter().filter(|ends| !ends.path.is_empty()).map(|ends| ends.mover);
-    let first = movers.next()??;
-    movers.all(|mover| mover == Some(first)).then_some(first)
+    in_common(segments, |ends| ends.mover)
+}
+
+/// A body, and another one above it or the world.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Span {
+    /// The joint that carries the body.
+    pub(crate) body: usize,
+    /// The one that carries what is above, or `WORLD`.
+    pub(crate) base: usize,
+}
+
+/// The one that all segments of a path are between whose lengths change.
+pub(crate) fn span(segments: &[PointPair]) -> Option<Span> {
+    in_common(segments, PointPair::span)
+}
+
+/// What is the same of all segments of a path whose lengths change.
+fn in_common<T: PartialEq>(
+    segments: &[PointPair],
+    of: impl Fn(&PointPair) -> Option<T>,
+) -> Option<T> {
+    let mut all = segments.iter().filter(|ends| !ends.path.is_empty()).map(of);
+    let first = all.next()??;
+    all.all(|own| own.as_ref() == Some(&first)).then_some(first)
 }
 
 /// Two points and the joints that move one against the other.
@@ -492,18 +539,22 @@ pub(crate) struct PointPair {
 }
 
 impl PointPair {
-    /// Whether one joint alone moves the points against each other, or one of them is fixed to the world.
-    pub(crate) fn is_moved_alone(&self) -> bool {
-        self.mover.is_some() || self.moving_end().is_some()
+    /// The end that all joints between the points carry, where the other one is fixed to the world or a body above.
+    pub(crate) fn moving_end(&self) -> Option<(&Attachment, Carries)> {
+        let [first, last] = [self.path.first()?, self.path.last()?];
+        match first.carries {
+            carries if carries != last.carries => None,
+            Carries::A => Some((&self.a, Carries::A)),
+            Carries::B => Some((&self.b, Carries::B)),
+            Carries::Both => None,
+        }
     }
 
-    /// The end on a body, where the other one is fixed to the world.
-    pub(crate) fn moving_end(&self) -> Option<(&Attachment, Carries)> {
-        match [self.a.joint, self.b.joint] {
-            [WORLD, _] => Some((&self.b, Carries::B)),
-            [_, WORLD] => Some((&self.a, Carries::A)),
-            _ => None,
-        }
+    /// The two bodies, where one is above the other.
+    pub(crate) fn span(&self) -> Option<Span> {
+        let (end, carries) = self.moving_end()?;
+        let base = if carries == Carries::A { &self.b } else { &self.a };
+        Some(Span { body: end.joint, base: base.joint })
     }
 
     /// Coordinates of the joints between the points.
@@ -696,7 +747,7 @@ impl Model {
     }
 
     /// Whether vectors of the joints generate the whole Newton matrix: without constraints, and what acts between
-    /// bodies with more than one joint between them, or couples coordinates.
+    /// bodies of which none is above the other, or couples coordinates.
     pub(crate) fn is_generated(&self) -> bool {
         let d = self.dimensions;
         let are_generated =
@@ -704,6 +755,7 @@ impl Model {
         d.constraints == 0
             && self.forces.as_ref().is_none_or(are_generated)
             && self.potentials.springs.iter().all(Spring::is_generated)
+            && self.field_ends.is_some()
             && self.armature.iter().all(|armature| armature.row == armature.column)
             && self.joints_are_in_order()
     }

@@ -277,6 +277,15 @@ pub(crate) fn forced_tree(seed: u64) -> Scene {
 /// A rope of rods hinged about x and y by turns, with ball joints on the way and a slide that is moved, and springs of
 /// both between bodies and the world; `more` goes on it. It goes by generators.
 pub(crate) fn pulled_rope(more: &str) -> Scene {
+    Scene::from_toml(&(rope_of_18() + PULLS + more)).unwrap()
+}
+
+/// The same rope, with what acts across several of its joints, from bodies above.
+pub(crate) fn braced_rope(more: &str) -> Scene {
+    Scene::from_toml(&(rope_of_18() + BRACES + more)).unwrap()
+}
+
+fn rope_of_18() -> String {
     let mut text =
         "format = 1\nname = \"pulled-rope\"\ngravity = [0.5, 0.0, -9.8]\ntime_step_s = 0.01\n"
             .to_owned();
@@ -294,10 +303,11 @@ pub(crate) fn pulled_rope(more: &str) -> Scene {
              body = {{ mass = 0.4, center_of_mass = [0.02, 0.0, -0.15], inertia = [0.02, 0.025, 0.01] }}\n"
         );
     }
-    text += r#"
-[[coordinates]]
-name = "f5"
-kind = "prescribed"
+    text + "[[coordinates]]\nname = \"f5\"\nkind = \"prescribed\"\n"
+}
+
+/// Springs of [`pulled_rope`], to the world.
+const PULLS: &str = r#"
 [[springs]]
 type = "two_point"
 a = { frame = "f17", at = [0.0, 0.1, -0.3] }
@@ -314,8 +324,60 @@ type = "orientation"
 frame = "f8"
 stiffness = 0.7
 "#;
-    Scene::from_toml(&(text + more)).unwrap()
-}
+
+/// Springs and a tendon of [`braced_rope`].
+const BRACES: &str = r#"
+[[inputs]]
+name = "tendon"
+points = [{ frame = "f9", at = [0.1, 0.05, -0.2] }, { frame = "f9", at = [0.1, 0.0, -0.3] }, { frame = "f13", at = [0.05, 0.1, -0.1] }]
+gain = 1.5
+[[springs]]
+type = "two_point"
+a = { frame = "f3", at = [0.0, 0.1, -0.3] }
+b = { frame = "world", at = [0.5, 0.3, -1.0] }
+stiffness = 6.0
+rest_length = 0.4
+[[springs]]
+type = "two_point"
+a = { frame = "f4", at = [0.1, 0.05, -0.2] }
+b = { frame = "f9", at = [0.05, 0.1, -0.1] }
+stiffness = 30.0
+rest_length = 0.4
+[[springs]]
+type = "path"
+points = [{ frame = "f16", at = [0.1, 0.05, -0.2] }, { frame = "f13", at = [0.05, 0.1, -0.1] }, { frame = "f16", at = [-0.1, 0.2, 0.1] }]
+stiffness = 20.0
+rest_length = 0.15
+[[springs]]
+type = "orientation"
+frame = "f8"
+stiffness = 0.7
+"#;
+
+/// Dampers of [`braced_rope`], a wrench, and drag.
+pub(crate) const BRAKES: &str = r#"
+[[inputs]]
+name = "thrust"
+[[forces]]
+type = "two_point_damper"
+a = { frame = "f9", at = [0.0, 0.1, -0.3] }
+b = { frame = "f4", at = [0.1, 0.3, -0.2] }
+damping = 0.6
+[[forces]]
+type = "path_damper"
+points = [{ frame = "f13", at = [0.1, 0.05, -0.2] }, { frame = "f15", at = [0.05, 0.1, -0.1] }, { frame = "f13", at = [-0.1, 0.2, 0.1] }]
+damping = 0.7
+[[forces]]
+type = "drag"
+frame = "f2"
+at = [0.1, 0.0, -0.2]
+coefficient = 0.3
+[[forces]]
+type = "body_wrench"
+frame = "f4"
+force = [0.3, "thrust", 0.2]
+torque = ["thrust", -0.1, 0.1]
+"#;
 
 /// What does not come from a potential, for [`pulled_rope`].
 pub(crate) const PUSHES: &str = r#"

@@ -102,6 +102,14 @@ fn add_moved<E: Eight, const B: usize>(
     }
 }
 
+/// Leaves the first block of each column alone.
+#[inline(always)]
+fn end<E: Eight, const B: usize>(flow: &mut Flow<E, B>) {
+    for own in &mut flow[1..] {
+        *own = [E::ZERO; 8];
+    }
+}
+
 #[inline(always)]
 fn of_blocks<E: Eight, const B: usize>(blocks: &Flow<Block, B>) -> Flow<E, B> {
     let mut all = [[E::ZERO; 8]; B];
@@ -148,37 +156,42 @@ impl<const B: usize> Columns<B> {
             }
             let mut any = false;
             for at in own.clone() {
-                let Group { axes: range, rows, kind, reach } = &groups[at];
+                let Group { axes: range, rows, kind, reach, is_end } = &groups[at];
                 any = any || reach.iter().any(|reach| has(reach, 0) || has(reach, n));
                 let (start, own_margins) = (rows.start, &margins.axes[range.clone()]);
-                if let GroupKind::Prescribed(_) = kind {
-                    for (own, column) in own_margins.iter().zip(start..) {
-                        let vectors = [&own.below, &own.push];
-                        add_moved(&mut flow, vectors, [column, n + column], first);
-                    }
-                    continue;
-                }
                 let increment = &mut self.increment[range.clone()];
                 let momentum = &mut self.momentum[range.clone()];
-                if !any {
-                    increment.fill(Block::ZERO);
-                    momentum.fill(Block::ZERO);
-                    continue;
+                match kind {
+                    GroupKind::Prescribed(_) => {
+                        for (own, column) in own_margins.iter().zip(start..) {
+                            let vectors = [&own.below, &own.push];
+                            add_moved(&mut flow, vectors, [column, n + column], first);
+                        }
+                    }
+                    _ if !any => {
+                        increment.fill(Block::ZERO);
+                        momentum.fill(Block::ZERO);
+                    }
+                    _ => {
+                        let group = Lifted {
+                            margins: own_margins,
+                            among: &margins.among[at],
+                            inverse: &within[at],
+                            increment,
+                            momentum,
+                            columns: [start, n + start],
+                            first,
+                        };
+                        match &axes[range.clone()] {
+                            [a] => group.lift([a], &mut flow),
+                            [a, b] => group.lift([a, b], &mut flow),
+                            [a, b, c] => group.lift([a, b, c], &mut flow),
+                            _ => {}
+                        }
+                    }
                 }
-                let group = Lifted {
-                    margins: own_margins,
-                    among: &margins.among[at],
-                    inverse: &within[at],
-                    increment,
-                    momentum,
-                    columns: [start, n + start],
-                    first,
-                };
-                match &axes[range.clone()] {
-                    [a] => group.lift([a], &mut flow),
-                    [a, b] => group.lift([a, b], &mut flow),
-                    [a, b, c] => group.lift([a, b, c], &mut flow),
-                    _ => {}
+                if B > 1 && *is_end {
+                    end(&mut flow);
                 }
             }
             if let (true, Some(Fork { place, .. })) = (any, hangs_from) {
@@ -207,7 +220,10 @@ impl<const B: usize> Columns<B> {
                 None => [[E::ZERO; 8]; B],
             };
             for at in own.clone().rev() {
-                let Group { axes: range, rows: own, kind, .. } = &groups[at];
+                let Group { axes: range, rows: own, kind, is_end, .. } = &groups[at];
+                if B > 1 && *is_end {
+                    end(&mut motion);
+                }
                 let (start, own_margins) = (own.start, &margins.axes[range.clone()]);
                 if let GroupKind::Prescribed(_) = kind {
                     for (own, column) in own_margins.iter().zip(start..) {

@@ -10,7 +10,7 @@ use crate::kkt::space::vectors::Vectors;
 use crate::kkt::space::{Added, Factor, SpatialRecursion};
 use crate::lagrangian::curvature::Curvature;
 use crate::lagrangian::generators::{MatrixKind, Step};
-use crate::model::mechanism::Model;
+use crate::model::mechanism::{Blocks, Model};
 
 /// The elimination of a step, with what derivatives need of it.
 #[derive(Clone, Debug)]
@@ -66,10 +66,16 @@ impl<const B: usize> Eliminated<B> {
     /// time                                             0.9           0.8            0.7            0.7         0.85
     /// and with vectors of two blocks     chain-8 4   quadruped 4.3   rope of 16 8   rope of 32 16
     /// time                                    1.05             1.2           0.75            0.43
+    /// and with three                     rope of 16 8   rope of 24 12   rope of 32 16   rope of 64 32
+    /// time                                        1.8             1.4            1.25            0.55
     /// ```
     fn is_faster_by_columns(&self, entries: usize) -> bool {
         let SpatialRecursion { axes, limbs, .. } = &self.recursion;
-        let least = if B == 1 { 31 } else { 48 };
+        let least = match B {
+            1 => 31,
+            2 => 48,
+            _ => 180,
+        };
         10 * entries > least * (axes.len() + limbs.len())
     }
 }
@@ -93,24 +99,34 @@ impl<const B: usize> InEights for FactorAndKeep<'_, B> {
 /// at the start, and by the momentum of dynamic and the next position of prescribed coordinates: `2n` columns.
 #[derive(Clone, Debug)]
 pub(crate) enum Derivatives {
-    OfBodies(Box<Eliminated<1>>),
-    WithFields(Box<Eliminated<2>>),
+    One(Box<Eliminated<1>>),
+    Two(Box<Eliminated<2>>),
+    Three(Box<Eliminated<3>>),
+}
+
+/// The same of each.
+macro_rules! of_any {
+    ($any:expr, $own:ident => $result:expr) => {
+        match $any {
+            Derivatives::One($own) => $result,
+            Derivatives::Two($own) => $result,
+            Derivatives::Three($own) => $result,
+        }
+    };
 }
 
 impl Derivatives {
     pub(crate) fn new(model: &Model) -> Self {
-        match model.has_fields() {
-            false => Self::OfBodies(Box::new(Eliminated::new(model))),
-            true => Self::WithFields(Box::new(Eliminated::new(model))),
+        match model.blocks() {
+            Blocks::One => Self::One(Box::new(Eliminated::new(model))),
+            Blocks::Two => Self::Two(Box::new(Eliminated::new(model))),
+            Blocks::Three => Self::Three(Box::new(Eliminated::new(model))),
         }
     }
 
     /// Whether all of them take less time than with so many entries in each triangle of the Newton matrix.
     pub(crate) fn is_faster(&self, entries: usize) -> bool {
-        match self {
-            Self::OfBodies(own) => own.is_faster_by_columns(entries),
-            Self::WithFields(own) => own.is_faster_by_columns(entries),
-        }
+        of_any!(self, own => own.is_faster_by_columns(entries))
     }
 
     /// Factors at the second derivatives of the bodies.
@@ -122,41 +138,26 @@ impl Derivatives {
     ) -> SmallestPivot {
         let vectors =
             Vectors { curvature, added, step: Step::new(time_step_s, MatrixKind::Newton) };
-        match self {
-            Self::OfBodies(all) => all.factor(vectors, own, inertia),
-            Self::WithFields(all) => all.factor(vectors, own, inertia),
-        }
+        of_any!(self, all => all.factor(vectors, own, inertia))
     }
 
     /// Makes room for all of them.
     pub(crate) fn make_room(&mut self) {
-        match self {
-            Self::OfBodies(all) => all.make_room(),
-            Self::WithFields(all) => all.make_room(),
-        }
+        of_any!(self, all => all.make_room());
     }
 
     /// Writes all of them into rows of whole blocks, for which there is room.
     pub(crate) fn write(&mut self, rows: Rows<'_>) {
-        match self {
-            Self::OfBodies(all) => all.write(rows),
-            Self::WithFields(all) => all.write(rows),
-        }
+        of_any!(self, all => all.write(rows));
     }
 
     /// The increments `x'` and momenta at the end that belong to changes `by` of the columns.
     pub(crate) fn push_forward(&mut self, by: &[f64], x: &mut [f64], momentum: &mut [f64]) {
-        match self {
-            Self::OfBodies(all) => all.push_forward(by, x, momentum),
-            Self::WithFields(all) => all.push_forward(by, x, momentum),
-        }
+        of_any!(self, all => all.push_forward(by, x, momentum));
     }
 
     /// The derivatives by the columns of `x · x' + momentum · p[k+1]'`; uses up `x`.
     pub(crate) fn pull_back(&mut self, x: &mut [f64], momentum: &[f64], by: &mut [f64]) {
-        match self {
-            Self::OfBodies(all) => all.pull_back(x, momentum, by),
-            Self::WithFields(all) => all.pull_back(x, momentum, by),
-        }
+        of_any!(self, all => all.pull_back(x, momentum, by));
     }
 }

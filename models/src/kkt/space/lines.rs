@@ -1,4 +1,4 @@
-//! Vectors of whole blocks: of eight numbers, or of sixteen where something acts on bodies from the world.
+//! Vectors of one to three whole blocks of eight numbers.
 
 use plantd_math::eights::Eight;
 use plantd_math::rows::Block;
@@ -27,14 +27,23 @@ impl<const B: usize> Line<B> {
 impl<E: Eight, const B: usize> InLine<E, B> {
     pub(crate) const ZERO: Self = Self([E::ZERO; B]);
 
-    /// Of a first block and, where there is one, a second.
+    /// Of a first block and, where there are more, a second and a third.
     #[inline(always)]
-    pub(crate) fn new(first: E, second: impl FnOnce() -> E) -> Self {
+    pub(crate) fn new(first: E, second: E, third: E) -> Self {
         let mut blocks = [first; B];
-        if let [_, last] = &mut blocks[..] {
-            *last = second();
+        if let [_, own, ..] = &mut blocks[..] {
+            *own = second;
+        }
+        if let [_, _, own] = &mut blocks[..] {
+            *own = third;
         }
         Self(blocks)
+    }
+
+    /// Its first block alone.
+    #[inline(always)]
+    pub(crate) fn ended(self) -> Self {
+        Self::new(self.0[0], E::ZERO, E::ZERO)
     }
 
     #[inline(always)]

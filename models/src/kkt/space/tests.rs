@@ -486,8 +486,10 @@ fn between(bodies: &[[&str; 2]]) -> String {
     for (k, [a, b]) in bodies.iter().enumerate() {
         let first = format!("{{ frame = \"{a}\", at = [0.2, 0.1, -0.3] }}");
         let last = format!("{{ frame = \"{b}\", at = [-0.1, 0.3, 0.2] }}");
-        let points =
-            format!("points = [{first}, {{ frame = \"{a}\", at = [0.1, -0.2, 0.1] }}, {last}]");
+        let points = format!(
+            "points = [{first}, {{ frame = \"{a}\", at = [0.1, -0.2, 0.1] }}, {last}, \
+             {{ frame = \"{a}\", at = [-0.2, 0.4, 0.3] }}]"
+        );
         for element in [
             format!(
                 "[[springs]]\ntype = \"two_point\"\na = {first}\nb = {last}\nstiffness = 20.0\nrest_length = 0.4"
@@ -536,8 +538,44 @@ fn what_acts_across_a_joint_is_generated() {
         let mut fast = move_alike(&model, steps);
         assert_generates(&mut fast);
     }
-    let far = between(&[["f3", "f9"]]);
-    assert_eq!(compiled(&rope(32, &far)).solver, Solver::Tree);
+}
+
+/// What acts from a body above, across several joints, ends there; moved joints in between or not.
+#[test]
+fn what_acts_from_a_body_above_is_generated() {
+    let tree = "gravity = [1.0, -2.0, -9.0]\ntime_step_s = 0.002";
+    let branches = [["f1", "f4"], ["f7", "f4"], ["f4", "f11"], ["f18", "f7"], ["f10", "world"]];
+    let limbs = [["hull", "f3"], ["f4", "hull"], ["f2", "f8"], ["f6", "f3"]];
+    let along = [["f3", "f9"], ["f3", "f8"], ["f11", "f9"], ["f20", "f11"], ["world", "f3"]];
+    let ball = ["f2_rx", "f2_ry", "f2_rz"];
+    for (steps, model) in [
+        (50, pulled(&branching(24, tree, ""), ["f1", "f0"], &between(&branches), &[])),
+        (
+            50,
+            pulled(
+                &branching(24, tree, "damping = 0.3"),
+                ["f1", "f22"],
+                &between(&branches),
+                &["f1", "f3", "f5", "f9"],
+            ),
+        ),
+        (50, pulled(&floating(), ["hull", "hull"], &between(&limbs), &[])),
+        (50, pulled(&floating(), ["hull", "hull"], &between(&limbs), &["f1", "f3", "f5"])),
+        (50, pulled(&floating(), ["hull", "f2"], &between(&limbs[..2]), &ball)),
+        (5, pulled(&compiled(&rope(24, "")), ["f2", "f3"], &between(&along), &[])),
+    ] {
+        let model = Arc::new(model);
+        assert!(model.field_ends.as_ref().is_some_and(|ends| ends.contains(&true)));
+        let mut fast = move_alike(&model, steps);
+        assert_generates(&mut fast);
+    }
+    let rope = |pairs: &[[&str; 2]]| compiled(&rope(48, &between(pairs)));
+    for apart in [["f3", "f12"], ["f9", "f12"], ["world", "f3"]] {
+        assert_eq!(rope(&[["f3", "f9"], apart]).solver, Solver::Spatial);
+    }
+    for overlapping in [["f5", "f8"], ["f8", "f12"], ["world", "f4"]] {
+        assert_eq!(rope(&[["f3", "f9"], overlapping]).solver, Solver::Tree);
+    }
 }
 
 /// Steps and linearizations in all registers that the processor has, from the same start: few joints and many, hinges
@@ -591,7 +629,7 @@ fn generators_are_chosen_where_they_stand_for_the_matrix() {
     let spring = "[[springs]]\ntype = \"coordinate\"\ncoordinate = \"f3\"\nstiffness = 30.0\n";
     assert_eq!(solver(spring), Solver::Spatial);
     assert!(compiled(&rope(32, "")).plan().contains("by generators, 32 joints"));
-    let between = "[[springs]]\ntype = \"two_point\"\na = { frame = \"f3\" }\nb = { frame = \"f9\" }\nstiffness = 30.0\n";
+    let on_a_sum = "[[springs]]\ntype = \"linear_spring\"\nterms = [{ coordinate = \"f3\", coefficient = 1.0 }, { coordinate = \"f9\", coefficient = 1.0 }]\nstiffness = 30.0\n";
     let ball = "[[frames]]\nname = \"ball\"\nparent = \"f31\"\njoint = { type = \"ball\" }\n\
                 body = { mass = 1.0, inertia = [1.0, 1.0, 1.0] }\n";
     assert_eq!(solver(ball), Solver::Spatial);
@@ -603,7 +641,7 @@ fn generators_are_chosen_where_they_stand_for_the_matrix() {
     chain.inputs.clear();
     chain.coordinates[0].kind = CoordinateKind::Prescribed;
     assert_eq!(Model::compile(&chain).unwrap().solver, Solver::Spatial);
-    assert_eq!(solver(between), Solver::Tree);
+    assert_eq!(solver(on_a_sum), Solver::Tree);
     for bushy in ["tree-30", "marionette", "spherical-pendulum"] {
         let model = Model::compile(&builtin::scene(bushy).unwrap()).unwrap();
         assert_eq!(model.solver, Solver::Tree, "{bushy}");

@@ -1,6 +1,6 @@
-//! The vectors of joints, of one block or of two.
+//! The vectors of joints, of one to three blocks.
 //!
-//! Without elements that act on bodies from the world they are those of
+//! Without elements that act on bodies from the world or from bodies above, they are those of
 //! [`generators`](crate::lagrangian::generators). With such elements the second block has, in the notation of
 //! [`fields`](crate::lagrangian::fields), what goes with the axes alone:
 //!
@@ -10,6 +10,15 @@
 //! ```
 //!
 //! which ball joints weigh as they do rates and slopes. Of a joint that is moved, `lower` counts `¼h pull − ½ drag`.
+//!
+//! `back` goes with rates as well as with axes, which stand in the first blocks of `plus` and `above`. What acts from a
+//! body ends there, but first blocks go on: where such an element follows velocities, there is a third block
+//!
+//! ```text
+//! plus = above = those of the first      lower = ½ back      push = back      minus = upper = carry = below = 0
+//! ```
+//!
+//! and `back` is in no first one.
 
 use plantd_math::eights::Eight;
 use plantd_math::spatial::Mat3;
@@ -63,7 +72,7 @@ struct Pulls<E> {
 
 /// What the axes of a ball joint that is moved give to a column each, of its start or of what is next.
 struct MovedBall<E> {
-    /// Rates and axes, and these as what acts from the world counts them.
+    /// Rates and axes, and these as what acts on bodies counts them.
     above: [[E; 3]; 2],
     below: [[E; 3]; 2],
 }
@@ -98,12 +107,13 @@ impl<E: Eight> MovedBall<E> {
 
     #[inline(always)]
     fn above<const B: usize>(&self, column: usize) -> InLine<E, B> {
-        InLine::new(self.above[0][column], || self.above[1][column])
+        let [own, axes] = &self.above;
+        InLine::new(own[column], axes[column], own[column])
     }
 
     #[inline(always)]
     fn below<const B: usize>(&self, column: usize) -> InLine<E, B> {
-        InLine::new(self.below[0][column], || self.below[1][column])
+        InLine::new(self.below[0][column], self.below[1][column], E::ZERO)
     }
 }
 
@@ -140,10 +150,10 @@ impl Vectors<'_> {
         }
         let Pulls { pull, turn, drag, back } = self.pulls::<E>(joint);
         Generators {
-            minus: InLine::new(own.minus, || axis),
-            plus: InLine::new(own.plus, || axis),
-            upper: InLine::new(own.upper, || pull.plus(drag)),
-            lower: InLine::new(own.lower.plus(back), || turn),
+            minus: InLine::new(own.minus, axis, E::ZERO),
+            plus: InLine::new(own.plus, axis, own.plus),
+            upper: InLine::new(own.upper, pull.plus(drag), E::ZERO),
+            lower: turned(own.lower, turn, back),
         }
     }
 
@@ -171,10 +181,10 @@ impl Vectors<'_> {
         for (a, all) in all.iter_mut().enumerate() {
             let own = &own[a];
             *all = Generators {
-                minus: InLine::new(own.minus, || minus[a]),
-                plus: InLine::new(own.plus, || plus[a]),
-                upper: InLine::new(own.upper, || pull[a].plus(drag[a])),
-                lower: InLine::new(own.lower.plus(back[a]), || turn[a]),
+                minus: InLine::new(own.minus, minus[a], E::ZERO),
+                plus: InLine::new(own.plus, plus[a], own.plus),
+                upper: InLine::new(own.upper, pull[a].plus(drag[a]), E::ZERO),
+                lower: turned(own.lower, turn[a], back[a]),
             };
         }
         (all, within)
@@ -257,12 +267,12 @@ impl Vectors<'_> {
     pub(crate) fn moved<E: Eight, const B: usize>(&self, joint: usize) -> Margin<InLine<E, B>> {
         let parts = self.step.parts::<E>(self.curvature, joint);
         let (own, axis) = (parts.generators(), parts.axis);
-        let pulls = || self.pulls::<E>(joint);
+        let Pulls { pull, drag, .. } = self.pulls::<E>(joint);
         Margin {
-            above: InLine::new(own.minus, || axis),
-            below: InLine::new(own.lower, || pulls().pull.minus(pulls().drag)),
-            carry: InLine::new(own.plus, || axis),
-            push: InLine::new(own.upper, || pulls().pull.plus(pulls().drag)),
+            above: InLine::new(own.minus, axis, own.minus),
+            below: InLine::new(own.lower, pull.minus(drag), E::ZERO),
+            carry: InLine::new(own.plus, axis, own.plus),
+            push: InLine::new(own.upper, pull.plus(drag), E::ZERO),
         }
     }
 }
@@ -271,11 +281,17 @@ impl Vectors<'_> {
 #[inline(always)]
 fn alone<E: Eight, const B: usize>(own: &Generators<E>) -> Generators<InLine<E, B>> {
     Generators {
-        minus: InLine::new(own.minus, || E::ZERO),
-        plus: InLine::new(own.plus, || E::ZERO),
-        upper: InLine::new(own.upper, || E::ZERO),
-        lower: InLine::new(own.lower, || E::ZERO),
+        minus: InLine::new(own.minus, E::ZERO, E::ZERO),
+        plus: InLine::new(own.plus, E::ZERO, E::ZERO),
+        upper: InLine::new(own.upper, E::ZERO, E::ZERO),
+        lower: InLine::new(own.lower, E::ZERO, E::ZERO),
     }
+}
+
+/// What takes the motion of axes above, with `turn` and `back`.
+#[inline(always)]
+fn turned<E: Eight, const B: usize>(own: E, turn: E, back: E) -> InLine<E, B> {
+    InLine::new(if B == 2 { own.plus(back) } else { own }, turn, back)
 }
 
 #[inline(always)]
@@ -283,7 +299,7 @@ fn twice<E: Eight>(numbers: E) -> E {
     numbers.plus(numbers)
 }
 
-/// A margin, with what acts from the world where that counts.
+/// A margin, with what acts on bodies where that counts.
 #[inline(always)]
 fn margin<E: Eight, const B: usize>(
     Flanks { carry, push, above, below, .. }: &Flanks<E>,
@@ -293,16 +309,16 @@ fn margin<E: Eight, const B: usize>(
 ) -> Margin<InLine<E, B>> {
     let Some(pulls) = pulls else {
         return Margin {
-            carry: InLine::new(*carry, || E::ZERO),
-            push: InLine::new(*push, || E::ZERO),
-            above: InLine::new(*above, || E::ZERO),
-            below: InLine::new(*below, || E::ZERO),
+            carry: InLine::new(*carry, E::ZERO, E::ZERO),
+            push: InLine::new(*push, E::ZERO, E::ZERO),
+            above: InLine::new(*above, E::ZERO, E::ZERO),
+            below: InLine::new(*below, E::ZERO, E::ZERO),
         };
     };
     Margin {
-        carry: InLine::new(*carry, || axis_of_row),
-        push: InLine::new(push.plus(twice(pulls.back)), || twice(pulls.turn)),
-        above: InLine::new(*above, || axis_of_column),
-        below: InLine::new(*below, || twice(pulls.pull)),
+        carry: InLine::new(*carry, axis_of_row, E::ZERO),
+        push: turned(*push, twice(pulls.turn), twice(pulls.back)),
+        above: InLine::new(*above, axis_of_column, *above),
+        below: InLine::new(*below, twice(pulls.pull), E::ZERO),
     }
 }

@@ -10,11 +10,13 @@
 
 use plantd_math::scalar::Scalar;
 
+use crate::lagrangian::fields::{Field, Take, at_point, change_at_point};
 use crate::lagrangian::forces::GeneralizedForce;
 use crate::lagrangian::forces::linear_damper::friction;
+use crate::lagrangian::forces::point::twist;
 use crate::lagrangian::instant::Instant;
-use crate::lagrangian::vectors::Distance;
-use crate::model::mechanism::{PathForce, PointPair, Resistance};
+use crate::lagrangian::vectors::{Distance, moving_ends};
+use crate::model::mechanism::{PathForce, PointPair, Resistance, Span, span};
 
 /// A path in motion.
 struct Moving<S> {
@@ -53,6 +55,39 @@ impl PathForce {
         };
         let driven = self.inputs.iter().fold(S::ZERO, |sum, &(k, g)| sum + at.inputs[k] * g);
         Moving { rate, resistance, tension: driven - held }
+    }
+}
+
+impl Field for PathForce {
+    fn span(&self) -> Option<Span> {
+        span(&self.segments)
+    }
+
+    fn has_rates(&self) -> bool {
+        !matches!(self.resistance, Resistance::Constant(0.0))
+    }
+
+    fn exert(&self, at: &Instant<'_>, take: Take<'_>) {
+        let Moving { rate, resistance: (c, by_length), tension } = self.moving(at);
+        let ends = || moving_ends(&self.segments, at.tree, at.poses);
+        for end in ends() {
+            let force = end.along * tension;
+            take(at_point(end.point, force), &|axis, axis_rate| {
+                let (mut longer, mut faster) = (0.0, 0.0);
+                for end in ends() {
+                    let velocity = twist(at, end.of).at(end.point);
+                    let relative = velocity - twist(at, end.base).at(end.base_point);
+                    let moved = axis.at(end.point);
+                    let accelerated = axis_rate.at(end.point) + axis.w.cross(velocity);
+                    longer += end.along.dot(moved);
+                    faster += end.turned(moved).dot(relative) + end.along.dot(accelerated);
+                }
+                let moved = axis.at(end.point);
+                let slacker = by_length * rate * longer + c * faster;
+                let changed = end.turned(moved) * tension - end.along * slacker;
+                change_at_point([end.point, force], [moved, changed])
+            });
+        }
     }
 }
 

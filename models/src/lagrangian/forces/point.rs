@@ -15,7 +15,7 @@ use crate::lagrangian::fields::{Field, Take, at_point, change_at_point};
 use crate::lagrangian::forces::GeneralizedForce;
 use crate::lagrangian::instant::Instant;
 use crate::lagrangian::vectors::Separation;
-use crate::model::mechanism::{Carries, PathJoint, PointForce, PointLaw};
+use crate::model::mechanism::{Carries, PathJoint, PointForce, PointLaw, Span};
 use crate::model::tree::{Attachment, WORLD};
 
 /// Points whose squared distance (m²) or speed (m²/s²) is below this coincide or rest: there is no
@@ -111,8 +111,12 @@ impl GeneralizedForce for PointForce {
 }
 
 impl Field for PointForce {
-    fn joint(&self) -> usize {
-        self.ends.moving_end().map_or(WORLD, |(end, _)| end.joint)
+    fn span(&self) -> Option<Span> {
+        self.ends.span()
+    }
+
+    fn has_rates(&self) -> bool {
+        true
     }
 
     fn exert(&self, at: &Instant<'_>, take: Take<'_>) {
@@ -155,7 +159,7 @@ impl PointForce {
 }
 
 /// Twist of what a point is fixed to.
-fn twist<S: Scalar>(at: &Instant<'_, S>, end: &Attachment) -> Motion<S> {
+pub(super) fn twist<S: Scalar>(at: &Instant<'_, S>, end: &Attachment) -> Motion<S> {
     if end.joint == WORLD { Motion::default() } else { at.momenta.twist_of(at.tree, end.joint) }
 }
 

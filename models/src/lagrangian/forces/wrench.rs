@@ -17,7 +17,8 @@ use plantd_math::spatial::{Force, Vec3};
 use crate::lagrangian::fields::{Field, Take};
 use crate::lagrangian::forces::GeneralizedForce;
 use crate::lagrangian::instant::Instant;
-use crate::model::mechanism::{Wrench, WrenchKind};
+use crate::model::mechanism::{Span, Wrench, WrenchKind};
+use crate::model::tree::WORLD;
 
 impl Wrench {
     /// About the origin of the joint's tree, in world axes.
@@ -103,8 +104,8 @@ impl GeneralizedForce for Wrench {
 }
 
 impl Field for Wrench {
-    fn joint(&self) -> usize {
-        self.at.joint
+    fn span(&self) -> Option<Span> {
+        Some(Span { body: self.at.joint, base: WORLD })
     }
 
     fn exert(&self, at: &Instant<'_>, take: Take<'_>) {

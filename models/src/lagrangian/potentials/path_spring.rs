@@ -9,10 +9,12 @@
 
 use plantd_math::scalar::Scalar;
 
+use crate::lagrangian::fields::{Field, Take, at_point, change_at_point};
+use crate::lagrangian::instant::Instant;
 use crate::lagrangian::kinematics::Place;
 use crate::lagrangian::potentials::Potential;
-use crate::lagrangian::vectors::Distance;
-use crate::model::mechanism::{PathLaw, PathSpring, PointPair};
+use crate::lagrangian::vectors::{Distance, moving_ends};
+use crate::model::mechanism::{PathLaw, PathSpring, PointPair, Span, span};
 
 impl PathSpring {
     /// Its segments at a configuration.
@@ -47,6 +49,28 @@ impl PathLaw {
         match self {
             Self::Spring { stiffness, .. } => S::constant(*stiffness),
             Self::Stop(stop) => stop.curvature(length),
+        }
+    }
+}
+
+impl Field for PathSpring {
+    fn span(&self) -> Option<Span> {
+        span(&self.segments)
+    }
+
+    fn exert(&self, at: &Instant<'_>, take: Take<'_>) {
+        let Instant { tree, poses, q, .. } = *at;
+        let length = self.length(Place { tree, poses, q });
+        let (tension, stiffness) = (self.law.tension(length), self.law.stiffness(length));
+        let ends = || moving_ends(&self.segments, tree, poses);
+        for end in ends() {
+            let force = end.along * -tension;
+            take(at_point(end.point, force), &|axis, _| {
+                let longer: f64 = ends().map(|end| end.along.dot(axis.at(end.point))).sum();
+                let moved = axis.at(end.point);
+                let changed = end.turned(moved) * -tension - end.along * (stiffness * longer);
+                change_at_point([end.point, force], [moved, changed])
+            });
         }
     }
 }

@@ -15,8 +15,7 @@ use crate::lagrangian::instant::Instant;
 use crate::lagrangian::kinematics::Place;
 use crate::lagrangian::potentials::Potential;
 use crate::lagrangian::vectors::Separation;
-use crate::model::mechanism::{Carries, PointSpring};
-use crate::model::tree::WORLD;
+use crate::model::mechanism::{Carries, PointSpring, Span};
 
 /// A two-point spring at one configuration.
 struct Stretched<S: Scalar> {
@@ -42,8 +41,8 @@ fn stretched<S: Scalar>(spring: &PointSpring, place: Place<'_, S>) -> Stretched<
 }
 
 impl Field for PointSpring {
-    fn joint(&self) -> usize {
-        self.ends.moving_end().map_or(WORLD, |(end, _)| end.joint)
+    fn span(&self) -> Option<Span> {
+        self.ends.span()
     }
 
     fn exert(&self, at: &Instant<'_>, take: Take<'_>) {
