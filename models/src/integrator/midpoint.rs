@@ -27,7 +27,7 @@ pub(crate) fn middle<S: Side>(x: S, q: S, q_low: S, per_radian: S, inverse: f64)
 
 impl Midpoint {
     /// Calls `take(orientation, torque)` for what depends on the turn and the velocity of one dynamic ball joint, beside
-    /// the bodies: what acts across it, where forces count `weight` times, and what acts on bodies from the world. It
+    /// the bodies: what acts across it, where forces count `weight` times, and what acts on bodies at poses. It
     /// may come more than once, and adds up.
     pub(crate) fn for_each_own_torque(
         &self,

@@ -38,7 +38,7 @@ pub(crate) struct KktSystem {
     /// How ball joints weigh their rows and columns.
     pub(crate) balls: Vec<Weights>,
     pub(crate) estimates: Estimates,
-    /// What acts on bodies from the world, where generators have that.
+    /// What acts on bodies from the world or from bodies above, where generators have that.
     pub(crate) fields: Option<Box<Fields>>,
     /// For linearizations by generators in space.
     pub(crate) in_space: Option<Derivatives>,

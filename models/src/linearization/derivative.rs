@@ -17,10 +17,10 @@ use crate::model::mechanism::Model;
 /// motions, and for whoever solves by iteration.
 ///
 /// Of one step of the midpoint rule of a tree it takes O(n) to find and to apply, and O(n) of memory, where `A` and
-/// `B` take O(n²): without constraints, and without springs, dampers and forces that act between two bodies. Springs,
-/// drag and forces at points and frames that act from the world are taken with equal halves
-/// ([`ForceSplit::Symmetric`](crate::ForceSplit)) alone. All else is by the matrices, to the same numbers. The memory
-/// is made by the first [`Plant::differentiate`](crate::Plant::differentiate).
+/// `B` take O(n²): without constraints, and without springs, dampers and forces between two bodies of which none is
+/// above the other. Springs, drag and forces at points and frames that act from the world, or from bodies above, are
+/// taken with equal halves ([`ForceSplit::Symmetric`](crate::ForceSplit)) alone. All else is by the matrices, to the
+/// same numbers. The memory is made by the first [`Plant::differentiate`](crate::Plant::differentiate).
 ///
 /// ```
 /// use std::sync::Arc;
@@ -74,7 +74,7 @@ enum Means {
 #[derive(Debug)]
 struct Generated {
     derivatives: Derivatives,
-    /// What acts on bodies from the world, where steps have not that.
+    /// What acts on bodies, where steps have not that.
     fields: Option<Box<Fields>>,
 }
 

@@ -58,8 +58,7 @@ pub struct Model {
     /// Ancestor and descendant pairs of which exactly one is prescribed.
     pub(crate) mixed_pairs: Vec<MixedPair>,
     /// Of each joint, whether what acts on bodies that it carries ends above it, at what it hangs from
-    /// ([`fields`](crate::lagrangian::fields)). `None` where the joints between two bodies are among those between two
-    /// others, or below the world and another one.
+    /// ([`fields`](crate::lagrangian::fields)). `None` where elements act across one joint from different bodies.
     pub(crate) field_ends: Option<Vec<bool>>,
     /// What pivots are compared with.
     pub(crate) conditioning: Conditioning,
