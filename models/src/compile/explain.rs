@@ -105,7 +105,7 @@ impl Model {
         line(match &self.forces {
             None => "forces        0 (skipped)".to_owned(),
             Some(forces) => format!(
-                "forces        {} wrenches, {} between points, {} on coordinates, {} linear, {} along paths",
+                "forces        {} wrenches, {} between points, {} on coordinates, {} linear, {} along paths or segments of them",
                 forces.wrenches.len(),
                 forces.point_forces.len(),
                 forces.coordinate_forces.len(),

@@ -72,11 +72,14 @@ impl Layout {
             places.add_damper_of_stop(spring, &mut forces);
         }
         for input in scene.inputs.iter().filter(|input| !input.points.is_empty()) {
-            forces.path_forces.push(PathForce {
-                segments: places.segments(&input.points),
+            // A tension that does not follow the length acts along each segment by itself, and couples no others.
+            let segments = places.segments(&input.points).into_iter();
+            let alone = segments.filter(|ends| !ends.path.is_empty()).map(|ends| PathForce {
+                segments: vec![ends],
                 inputs: vec![(self.inputs[input.name.as_str()], input.gain)],
                 resistance: Resistance::Constant(0.0),
             });
+            forces.path_forces.extend(alone);
         }
         (forces.coupling() + forces.coordinate_forces.len() > 0).then_some(forces)
     }

@@ -388,6 +388,7 @@ pub(crate) struct CoordinateStop {
 /// A force along a path: `f_i = (Σ g u − c L̇) L_i`.
 #[derive(Clone, Debug)]
 pub(crate) struct PathForce {
+    /// One alone, where nothing but inputs acts along it.
     pub(crate) segments: Vec<PointPair>,
     /// Inputs `u` and their `g`.
     pub(crate) inputs: Vec<(usize, f64)>,

@@ -569,6 +569,15 @@ fn what_acts_from_a_body_above_is_generated() {
         let mut fast = move_alike(&model, steps);
         assert_generates(&mut fast);
     }
+    // Two tendons along all of a rope, from body to body and from each to the one after the next.
+    let pulled_by = |first: usize, by: usize| {
+        let points = (first..24).step_by(by);
+        let points = points.map(|i| format!("{{ frame = \"f{i}\", at = [0.02, 0.01, -0.01] }}"));
+        let points = points.collect::<Vec<_>>().join(", ");
+        format!("[[inputs]]\nname = \"tendon{by}\"\npoints = [{points}]\ngain = -0.1\n")
+    };
+    let model = Arc::new(compiled(&rope(24, &(pulled_by(0, 1) + &pulled_by(1, 2)))));
+    assert_generates(&mut move_alike(&model, 5));
     let rope = |pairs: &[[&str; 2]]| compiled(&rope(48, &between(pairs)));
     for apart in [["f3", "f12"], ["f9", "f12"], ["world", "f3"]] {
         assert_eq!(rope(&[["f3", "f9"], apart]).solver, Solver::Spatial);
