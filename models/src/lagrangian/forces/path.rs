@@ -20,7 +20,7 @@ use crate::model::mechanism::{PathForce, PointPair, Resistance, Span, span};
 
 /// A path in motion.
 struct Moving<S> {
-    /// `L̇`.
+    /// `L̇`; nobody asks for that of a path without resistance.
     rate: S,
     /// `c` and `c'`.
     resistance: (S, S),
@@ -39,6 +39,10 @@ impl PathForce {
     }
 
     fn moving<S: Scalar>(&self, at: &Instant<'_, S>) -> Moving<S> {
+        let driven = self.inputs.iter().fold(S::ZERO, |sum, &(k, g)| sum + at.inputs[k] * g);
+        if !self.resists() {
+            return Moving { rate: S::ZERO, resistance: (S::ZERO, S::ZERO), tension: driven };
+        }
         let (mut length, mut rate) = (S::ZERO, S::ZERO);
         for segment in self.segments(at) {
             length += segment.length;
@@ -53,8 +57,12 @@ impl PathForce {
                 (held, (slope, S::ZERO))
             }
         };
-        let driven = self.inputs.iter().fold(S::ZERO, |sum, &(k, g)| sum + at.inputs[k] * g);
         Moving { rate, resistance, tension: driven - held }
+    }
+
+    /// Whether its tension changes with the length, or its rate.
+    fn resists(&self) -> bool {
+        !matches!(self.resistance, Resistance::Constant(0.0))
     }
 }
 
@@ -64,7 +72,7 @@ impl Field for PathForce {
     }
 
     fn has_rates(&self) -> bool {
-        !matches!(self.resistance, Resistance::Constant(0.0))
+        self.resists()
     }
 
     fn exert(&self, at: &Instant<'_>, take: Take<'_>) {
@@ -115,7 +123,7 @@ impl GeneralizedForce for PathForce {
         let Moving { rate, resistance: (c, by_length), tension } = self.moving(at);
         for segment in self.segments(at) {
             segment.for_each_second_derivative(|i, j, l_ij| entry(i, j, tension * l_ij, S::ZERO));
-            if matches!(self.resistance, Resistance::Constant(0.0)) {
+            if !self.resists() {
                 continue;
             }
             segment.for_each_derivative(|i, l_i| {
