@@ -30,12 +30,13 @@ impl Model {
 
     fn held_limbs(&self) -> Option<Held> {
         let d = self.dimensions;
-        if d.constraints == 0 || d.prescribed > 0 || self.constraint_rank() < d.constraints {
+        if d.constraints == 0 || self.constraint_rank() < d.constraints {
             return None;
         }
         let mut groups: Vec<Equations> = Vec::new();
         for (c, constraint) in self.constraints.iter().enumerate() {
-            let moved: BTreeSet<usize> = constraint.coordinates.iter().copied().collect();
+            let moved: BTreeSet<usize> =
+                constraint.coordinates[..constraint.dynamic].iter().copied().collect();
             match groups.last_mut().filter(|group| group.moved == moved) {
                 Some(group) => group.range.end = c + 1,
                 None => groups.push(Equations { range: c..c + 1, moved }),

@@ -243,7 +243,8 @@ impl Workspace {
         else {
             return Ok(false);
         };
-        let lengths = [out.stride, padded(out.next_columns())];
+        let columns = if out.nk > 0 { out.stride } else { padded(out.next_columns()) };
+        let lengths = [out.stride, columns];
         limbs.solve_rows(held, &mut out.increment, &mut out.multipliers, lengths);
         self.differentiate_momentum(at, out);
         Ok(true)

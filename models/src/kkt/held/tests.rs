@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use nalgebra::{DMatrix, DVector};
 use plantd_math::simd::narrowly;
-use plantd_scene::Scene;
+use plantd_scene::{Coordinate, CoordinateKind, Scene};
 
 use crate::integrator::settings::Settings;
 use crate::integrator::workspace::{StepContext, Workspace};
@@ -183,10 +183,45 @@ fn parallel(platform: Platform) -> Model {
     sketch.compile("damping = 0.02")
 }
 
-/// All that is eliminated limb by limb.
-fn models() -> [Model; 5] {
+/// The same with joints that are moved, by their names.
+fn driven(model: &Model, names: &[&str]) -> Model {
+    let mut scene = model.scene().clone();
+    let is_driven = |name: &str| names.contains(&name);
+    scene.inputs.retain(|input| !input.coordinate.as_deref().is_some_and(is_driven));
+    scene.coordinates.extend(names.iter().map(|name| Coordinate {
+        name: (*name).to_owned(),
+        kind: CoordinateKind::Prescribed,
+        ..Coordinate::default()
+    }));
+    Model::compile(&scene).unwrap()
+}
+
+/// All that is eliminated limb by limb; of the first ones a trunk and an arm are moved, a base, and the hip of a leg that
+/// carries a platform.
+fn models() -> [Model; 8] {
     let [first, last, on_leg] = [Platform::First, Platform::Last, Platform::OnLeg].map(parallel);
-    [humanoid(), carriage(0.1), first, last, on_leg]
+    let [humanoid, carriage] = [humanoid(), carriage(0.1)];
+    [
+        driven(&humanoid, &["f13", "f16", "f21"]),
+        driven(&carriage, &["f0"]),
+        driven(&on_leg, &["f0"]),
+        humanoid,
+        carriage,
+        first,
+        last,
+        on_leg,
+    ]
+}
+
+/// Inputs of a step: motors rest, and what is moved goes to and fro.
+fn input(plant: &Plant, k: u32) -> Vec<f64> {
+    let model = plant.model();
+    let (ni, mut u) = (model.dimensions().inputs, vec![0.0; model.dimensions().input()]);
+    for (i, u) in u[ni..].iter_mut().enumerate() {
+        let start = model.coordinates()[model.dimensions().dynamic + i].initial;
+        *u = start + 0.02 * (0.04 * f64::from(k + 1) * (1.0 + 0.3 * i as f64)).sin();
+    }
+    u
 }
 
 /// With limbs eliminated, and by the tree LU alone; moving.
@@ -194,8 +229,8 @@ fn both(model: Model) -> [Plant; 2] {
     let model = Arc::new(model);
     let mut fast = Plant::new(Arc::clone(&model), Settings::new(&model)).unwrap();
     fast.initialize(&Initial::Scene).unwrap();
-    for _ in 0..3 {
-        fast.step(&vec![0.0; model.dimensions().input()]).unwrap();
+    for k in 0..3 {
+        fast.step(&input(&fast, k)).unwrap();
     }
     let mut slow = fast.clone();
     let Workspace { kkt, response, .. } = &mut slow.workspace;
@@ -217,6 +252,7 @@ fn assert_near(a: &[f64], b: &[f64], tolerance: f64, what: &str) {
 fn dense(workspace: &mut Workspace, model: &Model, settings: &Settings) -> DMatrix<f64> {
     workspace.fill_newton_matrix(model, settings);
     let (nd, nc) = (model.dimensions.dynamic, model.dimensions.constraints);
+    let n = model.dimensions.coordinates();
     let (tree, elimination) = (&workspace.kkt.factored.tree, &model.elimination);
     let mut dense = DMatrix::zeros(nd + nc, nd + nc);
     for row in 0..nd {
@@ -226,8 +262,8 @@ fn dense(workspace: &mut Workspace, model: &Model, settings: &Settings) -> DMatr
             dense[(ancestor, row)] = tree.upper[slot];
         }
         for c in 0..nc {
-            dense[(row, nd + c)] = workspace.constraints.start.jacobian[c * nd + row];
-            dense[(nd + c, row)] = workspace.constraints.end.jacobian[c * nd + row];
+            dense[(row, nd + c)] = workspace.constraints.start.jacobian[c * n + row];
+            dense[(nd + c, row)] = workspace.constraints.end.jacobian[c * n + row];
         }
     }
     dense
@@ -238,8 +274,8 @@ fn a_solution_satisfies_the_dense_system() {
     for model in models() {
         assert_eq!(model.solver, Solver::Held);
         let [mut plant, _] = both(model);
+        let u = input(&plant, 3);
         let Plant { model, settings, state, workspace, .. } = &mut plant;
-        let u = vec![0.0; model.dimensions().input()];
         workspace.solve(StepContext { model, settings, state, u: &u }).unwrap();
         workspace.evaluate(model, settings, state);
         workspace.finish_end(model, state);
@@ -261,8 +297,8 @@ fn limbs_move_and_linearize_as_by_the_tree() {
     for model in models() {
         let [mut fast, mut slow] = both(model);
         let [mut a, mut b] = [&fast, &slow].map(|plant| Linearization::new(plant.model()));
-        let u = vec![0.0; fast.model().dimensions().input()];
-        for _ in 0..30 {
+        for k in 0..30 {
+            let u = input(&fast, k + 3);
             slow.restore(&fast.snapshot()).unwrap();
             fast.step_and_linearize(&u, &mut a).unwrap();
             slow.step_and_linearize(&u, &mut b).unwrap();
@@ -334,9 +370,12 @@ fn straight_legs_are_left_to_the_tree() {
 fn guesses_follow_from_the_state_alone() {
     for model in models() {
         let [mut plant, _] = both(model);
-        let count = plant.model().dimensions().input();
+        let (moved, count) = (plant.clone(), plant.model().dimensions().inputs);
         let input = |k: u32| -> Vec<f64> {
-            (0..count as u32).map(|i| 0.3 * f64::from(k * k + 7 * i).sin()).collect()
+            let mut u = input(&moved, k + 3);
+            let motors = u[..count].iter_mut().zip(0_u32..);
+            motors.for_each(|(u, i)| *u = 0.3 * f64::from(k * k + 7 * i).sin());
+            u
         };
         let mut out = Linearization::new(plant.model());
         let mut evaluations = 0;
@@ -368,10 +407,10 @@ fn wider_registers_give_the_same_bits() {
     for model in models() {
         let [wide, _] = both(model);
         let model = Arc::clone(wide.model());
-        let u = vec![0.0; model.dimensions().input()];
         let run = |mut plant: Plant| {
             let mut out = Linearization::new(&model);
-            for _ in 0..5 {
+            for k in 0..5 {
+                let u = input(&plant, k + 3);
                 plant.step_and_linearize(&u, &mut out).unwrap();
             }
             (plant.snapshot(), out.a(), out.multipliers_x())
