@@ -9,14 +9,15 @@
 use std::error::Error;
 use std::sync::Arc;
 
-use plantd_models::scene::{Body, Frame, Input, Joint, Scene};
+use plantd_models::scene::{Body, Force, Frame, Input, Joint, Scene, Spring};
 use plantd_models::{Fleet, Initial, Model, Plant, Settings, builtin};
 
 const PLANTS: usize = 64;
 const STEPS: usize = 200;
 const PASSES: usize = 15;
 
-const SCENES: [&str; 10] = [
+/// Those with a `+` have springs or dry friction in their joints, too.
+const SCENES: [&str; 13] = [
     "pendulum",
     "double-pendulum",
     "cart-pole",
@@ -24,6 +25,9 @@ const SCENES: [&str; 10] = [
     "chain-32",
     "spherical-pendulum",
     "arm-7",
+    "arm-7+springs",
+    "arm-7+friction",
+    "humanoid-30+springs",
     "tree-15",
     "tree-30",
     "humanoid-30",
@@ -45,7 +49,9 @@ fn main() -> Result<(), Box<dyn Error>> {
 }
 
 fn measure(name: &str, is_rough: bool) -> Result<(), Box<dyn Error>> {
-    let scene = robot(name).or_else(|| builtin::scene(name)).ok_or("no such scene")?;
+    let (bare, more) = name.split_once('+').unwrap_or((name, ""));
+    let mut scene = robot(bare).or_else(|| builtin::scene(bare)).ok_or("no such scene")?;
+    resist(&mut scene, more)?;
     let model = Arc::new(Model::compile(&scene)?);
     let settings = Settings { time_step_s: 0.001, ..Settings::new(&model) };
     let (n, width) = (model.dimensions().coordinates(), model.dimensions().input());
@@ -101,6 +107,28 @@ fn measure(name: &str, is_rough: bool) -> Result<(), Box<dyn Error>> {
         f64::from(iterations) / steps / PASSES as f64,
         f64::from(factorizations) / steps / PASSES as f64,
     );
+    Ok(())
+}
+
+/// Gives all joints that an input drives a spring, or dry friction.
+fn resist(scene: &mut Scene, by: &str) -> Result<(), Box<dyn Error>> {
+    let driven: Vec<String> = scene.inputs.iter().filter_map(|i| i.coordinate.clone()).collect();
+    for coordinate in driven {
+        match by {
+            "" => {}
+            "springs" => {
+                scene.springs.push(Spring::Coordinate { coordinate, stiffness: 3.0, rest: 0.1 });
+            }
+            "friction" => scene.forces.push(Force::Friction {
+                coordinate: Some(coordinate),
+                terms: Vec::new(),
+                points: Vec::new(),
+                force: 0.1,
+                velocity: 0.05,
+            }),
+            _ => return Err("springs or friction".into()),
+        }
+    }
     Ok(())
 }
 

@@ -1,5 +1,6 @@
 //! Fleets move each of their plants as it moves by itself, to the last bit.
 
+use std::path::Path;
 use std::sync::Arc;
 
 use crate::common::{Numbers, builtin, methods, model, random_tree};
@@ -102,6 +103,60 @@ fn plants_move_as_they_do_by_themselves() {
             assert_eq!(fleet.len(), count);
         }
     }
+}
+
+/// Linear springs and dry friction of joints go side by side, in space and in planes, few joints and many; what branches
+/// does not.
+#[test]
+fn and_so_do_those_with_springs_and_friction() {
+    for name in ["pendulum", "double-pendulum", "chain-8", "tree-15", "spherical-pendulum"] {
+        let scene = builtin(name);
+        let names: Vec<String> = {
+            let model = model(&scene);
+            model.coordinates().iter().map(|coordinate| coordinate.name.clone()).collect()
+        };
+        let each = |more: &dyn Fn(&str) -> String| names.iter().map(|name| more(name)).collect();
+        let springs: String = each(&|name| {
+            format!(
+                "[[springs]]\ntype = \"coordinate\"\ncoordinate = \"{name}\"\nstiffness = 2.5\nrest = 0.2\n"
+            )
+        });
+        let friction: String = each(&|name| {
+            format!(
+                "[[forces]]\ntype = \"friction\"\ncoordinate = \"{name}\"\nforce = 0.3\nvelocity = 0.2\n"
+            )
+        });
+        let drag: String = each(&|name| {
+            format!(
+                "[[forces]]\ntype = \"coordinate_drag\"\ncoordinate = \"{name}\"\ncoefficient = 0.1\n"
+            )
+        });
+        for (more, is_side_by_side) in [
+            (springs.clone(), true),
+            (friction.clone(), true),
+            (springs + &friction, true),
+            (drag, false),
+        ] {
+            let model = model(&Scene::from_toml(&(scene.to_toml() + &more)).unwrap());
+            for count in [5, 9] {
+                let fleet = compare(&model, usual(&model), count, 1.0, name);
+                assert_eq!(fleet.is_side_by_side(), is_side_by_side, "{name}{more}");
+            }
+        }
+    }
+}
+
+#[test]
+fn and_so_do_those_with_each_element() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../scenes/elements");
+    let mut side_by_side = 0;
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        let model = model(&Scene::from_toml(&std::fs::read_to_string(&path).unwrap()).unwrap());
+        let fleet = compare(&model, usual(&model), 5, 0.3, &path.display().to_string());
+        side_by_side += usize::from(fleet.is_side_by_side());
+    }
+    assert!(side_by_side >= 5, "{side_by_side}");
 }
 
 #[test]

@@ -30,7 +30,7 @@ use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::mechanics::Kept;
 use crate::lagrangian::nudge::Nudge;
 use crate::lagrangian::planar::PlanarTree;
-use crate::model::mechanism::{Model, Solver};
+use crate::model::mechanism::{CoordinateLaw, Forces, Model, Solver, Spring};
 
 /// The memory of a step of plants side by side.
 #[derive(Clone, Debug)]
@@ -130,7 +130,13 @@ impl<S: Planar> System<S> {
         let (h, inertia) = (settings.time_step_s, &model.conditioning.inertia);
         match self {
             Self::Tree(matrix) => {
+                if model.potentials.couple_branches {
+                    matrix.clear();
+                }
                 mid.fill_newton_matrix(model, settings, matrix);
+                if let Some(forces) = &model.forces {
+                    mid.add_forces_to_newton_matrix(model, forces, settings, matrix);
+                }
                 matrix.factor(&model.elimination, inertia, 1.0 / h.abs()).relative
             }
             Self::Planar(matrix) => {
@@ -187,8 +193,9 @@ fn store<const N: usize>(lane: usize, from: &[LanesOf<N>], to: &mut [f64]) {
 }
 
 impl Model {
-    /// Whether plants with these settings have a way side by side: trees of bodies alone, with damping, armatures
-    /// and inputs on coordinates, in space by the elimination tree and in planes; one midpoint step a period.
+    /// Whether plants with these settings have a way side by side: trees of bodies alone, with damping, armatures,
+    /// inputs, linear springs and dry friction on coordinates, in space by the elimination tree and in planes; one
+    /// midpoint step a period.
     pub(crate) fn goes_abreast(&self, settings: &Settings) -> bool {
         let d = self.dimensions;
         settings.order == 2
@@ -197,10 +204,20 @@ impl Model {
             && d.prescribed == 0
             && d.constraints == 0
             && self.orientations.is_empty()
-            && self.forces.is_none()
-            && self.potentials.springs.is_empty()
+            && self.forces.as_ref().is_none_or(Forces::go_abreast)
+            && self.potentials.springs.iter().all(Spring::is_linear)
             && self.signals.is_empty()
             && matches!(self.solver, Solver::Tree | Solver::Planar)
+    }
+}
+
+impl Forces {
+    /// Whether none branches, and all are on single coordinates.
+    fn go_abreast(&self) -> bool {
+        let is_smooth = |law: &CoordinateLaw| {
+            matches!(law, CoordinateLaw::Friction { .. } | CoordinateLaw::Constant(_))
+        };
+        self.coupling() == 0 && self.coordinate_forces.iter().all(|force| is_smooth(&force.law))
     }
 }
 

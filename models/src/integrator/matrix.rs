@@ -12,7 +12,7 @@ use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::turning::Weights;
 use crate::model::manifold::orientations;
-use crate::model::mechanism::{Forces, Model};
+use crate::model::mechanism::Model;
 
 impl Workspace {
     /// Factors the KKT system at the last evaluation: by a recursion where that is sound, else by the tree LU of
@@ -143,7 +143,8 @@ impl Workspace {
         }
         self.mid.fill_newton_matrix(model, settings, &mut self.kkt.factored.tree);
         if let Some(forces) = &model.forces {
-            self.add_forces_to_newton_matrix(model, forces, settings);
+            let matrix = &mut self.kkt.factored.tree;
+            self.mid.add_forces_to_newton_matrix(model, forces, settings, matrix);
         }
     }
 
@@ -157,19 +158,6 @@ impl Workspace {
         self.kkt
             .factor_tree(model, settings.time_step_s, settings.singular_below)
             .map_err(|pivot| model.singular_matrix(pivot))
-    }
-
-    /// Adds the part `a (½h f_q + f_v)` of forces to the Newton matrix.
-    fn add_forces_to_newton_matrix(&mut self, model: &Model, forces: &Forces, settings: &Settings) {
-        let (a, half) = (settings.force_split.at_start(), 0.5 * settings.time_step_s);
-        let dynamic = model.dimensions.dynamic;
-        let instant = self.mid.instant(model);
-        let matrix = &mut self.kkt.factored.tree;
-        forces.for_each_derivative(&instant, |i, j, by_q, by_v| {
-            if i < dynamic && j < dynamic {
-                matrix.add(&model.elimination, i, j, a * (half * by_q + by_v));
-            }
-        });
     }
 
     /// Factors by the tree what a recursion has factored last, for those that need `K⁻¹` and `S` apart.

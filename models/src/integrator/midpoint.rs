@@ -15,7 +15,7 @@ use crate::lagrangian::instant::Instant;
 use crate::lagrangian::kinematics::Place;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::{armature, forces};
-use crate::model::mechanism::{Model, Mover, Spring};
+use crate::model::mechanism::{Forces, Model, Mover, Spring};
 use crate::model::tree::JointKind;
 
 /// The midpoint of an increment `x`: `q0 + ½x`, `x/h` with `1/h` given, and the first without whole turns.
@@ -222,6 +222,23 @@ impl<S: Planar> Midpoint<S> {
                 }
             });
         }
+    }
+
+    /// Adds the part `a (½h f_q + f_v)` of forces to `K` at the last evaluation.
+    pub(crate) fn add_forces_to_newton_matrix(
+        &self,
+        model: &Model,
+        forces: &Forces,
+        settings: &Settings,
+        matrix: &mut TreeLu<S>,
+    ) {
+        let (a, half) = (settings.force_split.at_start(), 0.5 * settings.time_step_s);
+        let dynamic = model.dimensions.dynamic;
+        forces.for_each_derivative(&self.instant(model), |i, j, by_q, by_v| {
+            if i < dynamic && j < dynamic {
+                matrix.add(&model.elimination, i, j, (by_q * half + by_v) * a);
+            }
+        });
     }
 
     /// What forces depend on, at the last evaluation.
