@@ -18,8 +18,9 @@
 //! as in [`planar`](crate::kkt::planar), from the leaves to the root; the pivots are those of an elimination axis
 //! by axis. A joint whose motion is prescribed is passed by: `A` goes on to its parent as it is. Where what acts on
 //! bodies ends, at a body that it acts from, `A` goes on with the first block of its rows and columns alone, and so do
-//! the flows of right-hand sides. Each step up the tree waits for the one before, so it counts how many there are. As all sums are about one origin, the solution
-//! loses digits in long chains (up to 1e-11 of it in one of 64 hinges), which the next correction makes good.
+//! the flows of right-hand sides. Each step up the tree waits for the one before, so it counts how many there are. As
+//! all sums are about one origin, the solution loses digits in long chains (up to 1e-11 of it in one of 64 hinges),
+//! which the next correction makes good.
 
 pub(crate) mod columns;
 pub(crate) mod derivatives;

@@ -22,8 +22,8 @@
 //!
 //! What acts from a body above acts on that one too, and nothing of it changes with the joints above both, which
 //! feel nothing of it. Between the bodies it is as if from the world, so sums end above the joint that hangs from
-//! the upper one. One set of vectors for each joint has no more than one such end for all elements that a joint is
-//! between ([`Model::find_field_ends`]); others are for matrices that are filled entry by entry.
+//! the upper one. All that acts across one joint has to be from the same body for that, or from the world
+//! ([`Model::find_field_ends`]); else matrices are filled entry by entry.
 
 use plantd_math::eights::{Eight, InEights, in_eights};
 use plantd_math::rows::Block;
