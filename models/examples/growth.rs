@@ -1,7 +1,8 @@
 //! How the time of a step, of A and B, of products with them, and the memory of a plant grow with a rope in space that has what sends other
 //! programs to dense matrices: a top that is moved, a ball joint, and a spring from its tip to the world.
 //!
-//! `cargo run --release -p plantd-models --example growth`
+//! `cargo run --release -p plantd-models --example growth`, with `-- braced` for springs all along, each over two of
+//! the joints, in place of the one to the world
 
 use std::error::Error;
 use std::hint::black_box;
@@ -16,7 +17,7 @@ const SIZES: [usize; 4] = [64, 128, 256, 512];
 
 /// Thin rods, 1 m and 1 kg together, hinged about x and y by turns below a slide that is moved. The last one has a ball
 /// joint.
-fn rope(joints: usize) -> Result<Scene, Box<dyn Error>> {
+fn rope(joints: usize, is_braced: bool) -> Result<Scene, Box<dyn Error>> {
     let rods = joints - 2;
     let length = 1.0 / rods as f64;
     let across = length.powi(3) / 12.0;
@@ -44,11 +45,19 @@ fn rope(joints: usize) -> Result<Scene, Box<dyn Error>> {
     text += "[[coordinates]]\nname = \"rod0\"\nkind = \"prescribed\"\n\
              [[coordinates]]\nname = \"rod1\"\ninitial = 0.2\n\
              [[coordinates]]\nname = \"rod2\"\ninitial = 0.2\n";
-    text += &format!(
-        "[[springs]]\ntype = \"two_point\"\na = {{ frame = \"rod{}\" }}\n\
-         b = {{ frame = \"world\", at = [0.0, 0.0, -1.2] }}\nstiffness = 2.0\n",
-        rods - 1
-    );
+    let mut spring = |rod: usize, end: &str| {
+        text += &format!(
+            "[[springs]]\ntype = \"two_point\"\na = {{ frame = \"rod{rod}\" }}\n\
+             b = {{ {end} }}\nstiffness = 2.0\n"
+        );
+    };
+    if is_braced {
+        for rod in (3..rods).step_by(2) {
+            spring(rod, &format!("frame = \"rod{}\", at = [0.01, 0.02, 0.0]", rod - 2));
+        }
+    } else {
+        spring(rods - 1, "frame = \"world\", at = [0.0, 0.0, -1.2]");
+    }
     Ok(Scene::from_toml(&text)?)
 }
 
@@ -100,12 +109,13 @@ fn exponent(numbers: &[f64]) -> f64 {
 }
 
 fn main() -> Result<(), Box<dyn Error>> {
+    let is_braced = std::env::args().nth(1).is_some_and(|more| more == "braced");
     let mut all: [Vec<f64>; 6] = Default::default();
     println!(
         "µs       step   + A and B   + derivative as map   a product   transposed   plant, KiB"
     );
     for joints in SIZES {
-        let model = Arc::new(Model::compile(&rope(joints)?)?);
+        let model = Arc::new(Model::compile(&rope(joints, is_braced)?)?);
         let settings = Settings::new(&model);
         let mut plant = Plant::new(Arc::clone(&model), settings)?;
         let d = model.dimensions();

@@ -130,13 +130,7 @@ impl<S: Planar> System<S> {
         let (h, inertia) = (settings.time_step_s, &model.conditioning.inertia);
         match self {
             Self::Tree(matrix) => {
-                if model.potentials.couple_branches {
-                    matrix.clear();
-                }
                 mid.fill_newton_matrix(model, settings, matrix);
-                if let Some(forces) = &model.forces {
-                    mid.add_forces_to_newton_matrix(model, forces, settings, matrix);
-                }
                 matrix.factor(&model.elimination, inertia, 1.0 / h.abs()).relative
             }
             Self::Planar(matrix) => {

@@ -241,6 +241,9 @@ impl Workspace {
         self.weigh_balls(model, settings);
         let Self { mid, kkt, balls, .. } = self;
         let (matrix, weights) = (&mut kkt.factored.tree, &kkt.balls[..]);
+        if model.couples_more_than_bodies() {
+            matrix.clear();
+        }
         let step = Step::new(h, MatrixKind::Newton);
         let BallJoints { generators, within, .. } = balls;
         let curvature = &mid.mechanics.curvature;

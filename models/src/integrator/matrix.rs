@@ -134,17 +134,10 @@ impl Workspace {
     /// Fills `K` at the last evaluation.
     pub(crate) fn fill_newton_matrix(&mut self, model: &Model, settings: &Settings) {
         self.kkt.factored.tree.make_room(&model.elimination);
-        if model.potentials.couple_branches || model.forces.is_some() {
-            self.kkt.factored.tree.clear();
-        }
-        if !model.orientations.is_empty() {
+        if model.orientations.is_empty() {
+            self.mid.fill_newton_matrix(model, settings, &mut self.kkt.factored.tree);
+        } else {
             self.fill_turned_newton_matrix(model, settings);
-            return;
-        }
-        self.mid.fill_newton_matrix(model, settings, &mut self.kkt.factored.tree);
-        if let Some(forces) = &model.forces {
-            let matrix = &mut self.kkt.factored.tree;
-            self.mid.add_forces_to_newton_matrix(model, forces, settings, matrix);
         }
     }
 

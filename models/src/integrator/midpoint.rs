@@ -169,7 +169,7 @@ impl<S: Planar> Midpoint<S> {
         }
     }
 
-    /// Fills `K` of a model without ball joints at the last evaluation, but for forces.
+    /// Fills `K` of a model without ball joints at the last evaluation.
     pub(crate) fn fill_newton_matrix(
         &mut self,
         model: &Model,
@@ -177,6 +177,9 @@ impl<S: Planar> Midpoint<S> {
         matrix: &mut TreeLu<S>,
     ) {
         let h = settings.time_step_s;
+        if model.couples_more_than_bodies() {
+            matrix.clear();
+        }
         self.mechanics.fill_newton_matrix(model, h, matrix);
         if model.potentials.any {
             let dynamic = model.dimensions.dynamic;
@@ -192,6 +195,9 @@ impl<S: Planar> Midpoint<S> {
         for (i, c) in model.damping.iter().enumerate() {
             let slot = model.elimination.offsets[i + 1] - 1;
             matrix.add_to_diagonal(slot, S::constant(-settings.force_split.at_start() * c));
+        }
+        if let Some(forces) = &model.forces {
+            self.add_forces_to_newton_matrix(model, forces, settings, matrix);
         }
     }
 
@@ -225,7 +231,7 @@ impl<S: Planar> Midpoint<S> {
     }
 
     /// Adds the part `a (½h f_q + f_v)` of forces to `K` at the last evaluation.
-    pub(crate) fn add_forces_to_newton_matrix(
+    fn add_forces_to_newton_matrix(
         &self,
         model: &Model,
         forces: &Forces,

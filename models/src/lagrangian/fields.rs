@@ -31,9 +31,7 @@ use plantd_math::spatial::{Force, Mat3, Motion, Vec3};
 
 use crate::lagrangian::instant::Instant;
 use crate::lagrangian::momenta::Momenta;
-use crate::model::mechanism::{
-    Blocks, Forces, Model, PointPair, Potentials, Span, Spring, mover, span,
-};
+use crate::model::mechanism::{Blocks, Forces, Model, Potentials, Span, Spring, mover, span};
 use crate::model::tree::{Tree, WORLD};
 
 /// Takes a wrench, and its change with the motion of the body `(J, J̇)`.
@@ -205,14 +203,12 @@ impl Forces {
             .chain(along.map(|force| force as &dyn Field))
     }
 
-    /// Whether all act on bodies from the world or one above, or on one joint, and none couple more.
+    /// Whether all act on bodies from the world or from one above, or on single coordinates, and none couple more.
     pub(crate) fn are_generated(&self) -> bool {
         let Self { linear_dampers, path_forces, point_forces, .. } = self;
-        let are_along = |segments: &[_]| mover(segments).is_some() || span(segments).is_some();
-        let are_at = |ends: &PointPair| ends.mover.is_some() || ends.span().is_some();
         linear_dampers.is_empty()
-            && path_forces.iter().all(|force| are_along(&force.segments))
-            && point_forces.iter().all(|force| are_at(&force.ends))
+            && path_forces.iter().all(|force| span(&force.segments).is_some())
+            && point_forces.iter().all(|force| force.ends.span().is_some())
     }
 }
 

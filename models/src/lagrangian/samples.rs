@@ -5,7 +5,7 @@ use std::path::Path;
 use plantd_math::rotation;
 use plantd_math::scalar::{Dual, Scalar};
 use plantd_math::spatial::{Mat3, Vec3};
-use plantd_scene::Scene;
+use plantd_scene::{Coordinate, CoordinateKind, Scene, Spring};
 
 use crate::lagrangian::kinematics::Poses;
 use crate::model::manifold::orientations;
@@ -134,6 +134,22 @@ fn random_scene(seed: u64) -> Scene {
 /// A number between −1 and 1 that looks random.
 pub(crate) fn wave(i: usize) -> f64 {
     (12.9898 * i as f64 + 0.3).sin()
+}
+
+/// Some coordinates are moved; what acts on them alone goes.
+pub(crate) fn prescribe(scene: &mut Scene, names: &[&str]) {
+    let is_moved = |name: &str| names.contains(&name);
+    scene.coordinates.retain(|coordinate| !is_moved(&coordinate.name));
+    scene.coordinates.extend(names.iter().map(|name| Coordinate {
+        name: (*name).to_owned(),
+        kind: CoordinateKind::Prescribed,
+        ..Coordinate::default()
+    }));
+    scene.inputs.retain(|input| !input.coordinate.as_deref().is_some_and(is_moved));
+    scene.springs.retain(|spring| match spring {
+        Spring::Coordinate { coordinate, .. } => !is_moved(coordinate),
+        _ => true,
+    });
 }
 
 /// Friction, drag and stops of coordinates: a prefix and numbers.

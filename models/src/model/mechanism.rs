@@ -219,15 +219,13 @@ impl Spring {
 }
 
 impl Spring {
-    /// Whether it acts on one coordinate, on one joint, or on a body from the world or one above it.
+    /// Whether it acts on one coordinate, or on a body from the world or from one above it, across one joint or more.
     fn is_generated(&self) -> bool {
         match self {
             Self::Coordinate(_) | Self::Spline(_) | Self::Stop(_) | Self::Orientation(_) => true,
-            Self::Point(spring) => spring.ends.mover.is_some() || spring.ends.span().is_some(),
+            Self::Point(spring) => spring.ends.span().is_some(),
             Self::Linear(_) => !self.couples_branches(),
-            Self::Path(spring) => {
-                mover(&spring.segments).is_some() || span(&spring.segments).is_some()
-            }
+            Self::Path(spring) => span(&spring.segments).is_some(),
         }
     }
 
@@ -758,6 +756,11 @@ impl Model {
             && self.field_ends.is_some()
             && self.armature.iter().all(|armature| armature.row == armature.column)
             && self.joints_are_in_order()
+    }
+
+    /// Whether springs, armatures or forces may have entries in the Newton matrix where bodies have none.
+    pub(crate) fn couples_more_than_bodies(&self) -> bool {
+        self.potentials.couple_branches || self.forces.is_some()
     }
 
     /// Whether each coordinate has a joint, the dynamic ones in their order.

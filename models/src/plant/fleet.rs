@@ -17,8 +17,9 @@ use crate::plant::solve::CALM;
 /// Every plant moves as [`Plant::step`] would move it, to the same bits, whatever the others do; one that fails
 /// stays where it was. Where the model allows it, several are computed at once, each in a lane of wide registers:
 /// trees of joints in space or in planes with linear springs and dry friction of coordinates, without constraints, ball
-/// joints, other springs and forces, signals and prescribed coordinates, by the midpoint rule in one step. All others are stepped one after the other. A
-/// plant whose step is not the usual one (the first, or one that has to be halved) is stepped by itself.
+/// joints, other springs and forces, signals and prescribed coordinates, by the midpoint rule in one step. All others
+/// are stepped one after the other. A plant whose step is not the usual one (the first, or one that has to be halved)
+/// is stepped by itself.
 ///
 /// After construction steps allocate nothing, as those of plants. A step costs a plant what it costs it by itself;
 /// side by side, for each of many, half to a fifth of that.

@@ -5,11 +5,12 @@ use std::sync::Arc;
 
 use nalgebra::{DMatrix, DVector};
 use plantd_math::simd::narrowly;
-use plantd_scene::{Coordinate, CoordinateKind, Scene};
+use plantd_scene::Scene;
 
 use crate::integrator::settings::Settings;
 use crate::integrator::workspace::{StepContext, Workspace};
 use crate::kkt::system::{Factors, Recursion};
+use crate::lagrangian::samples::prescribe;
 use crate::linearization::linearize::Linearization;
 use crate::linearization::second_order::contraction::Contraction;
 use crate::linearization::second_order::tensors::SecondOrder;
@@ -186,13 +187,7 @@ fn parallel(platform: Platform) -> Model {
 /// The same with joints that are moved, by their names.
 fn driven(model: &Model, names: &[&str]) -> Model {
     let mut scene = model.scene().clone();
-    let is_driven = |name: &str| names.contains(&name);
-    scene.inputs.retain(|input| !input.coordinate.as_deref().is_some_and(is_driven));
-    scene.coordinates.extend(names.iter().map(|name| Coordinate {
-        name: (*name).to_owned(),
-        kind: CoordinateKind::Prescribed,
-        ..Coordinate::default()
-    }));
+    prescribe(&mut scene, names);
     Model::compile(&scene).unwrap()
 }
 

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use nalgebra::{DMatrix, DVector};
 use plantd_math::simd::{AVX2, AVX512, PORTABLE, within};
 use plantd_math::tree_lu::TreeLu;
-use plantd_scene::{Coordinate, CoordinateKind, Scene, Spring, builtin};
+use plantd_scene::{CoordinateKind, Scene, builtin};
 
 use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
@@ -15,7 +15,7 @@ use crate::kkt::space::derivatives::Derivatives;
 use crate::kkt::system::{Linearized, Recursion};
 use crate::lagrangian::fields::Fields;
 use crate::lagrangian::generators::MatrixKind;
-use crate::lagrangian::samples::rubbing;
+use crate::lagrangian::samples::{prescribe, rubbing};
 use crate::linearization::linearize::Linearization;
 use crate::model::mechanism::{Model, Solver};
 use crate::plant::facade::Plant;
@@ -357,21 +357,6 @@ fn move_alike(model: &Arc<Model>, steps: u32) -> Plant {
 
 fn apart(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).fold(0.0_f64, |most, (a, b)| most.max((a - b).abs()))
-}
-
-/// Some coordinates are moved; what acts on them alone goes.
-fn prescribe(scene: &mut Scene, names: &[&str]) {
-    let is_moved = |name: &str| names.contains(&name);
-    scene.coordinates.retain(|coordinate| !is_moved(&coordinate.name));
-    scene.coordinates.extend(names.iter().map(|name| Coordinate {
-        name: (*name).to_owned(),
-        kind: CoordinateKind::Prescribed,
-        ..Coordinate::default()
-    }));
-    scene.springs.retain(|spring| match spring {
-        Spring::Coordinate { coordinate, .. } => !is_moved(coordinate),
-        _ => true,
-    });
 }
 
 /// The floating hull and a tree that branches, with joints that are moved: at a root, on the way, below a fork and at a

@@ -9,6 +9,7 @@
 //! with `L` the sum of the lengths of the path's segments.
 
 use plantd_math::scalar::Scalar;
+use plantd_math::spatial::{Force, Vec3};
 
 use crate::lagrangian::fields::{Field, Take, at_point, change_at_point};
 use crate::lagrangian::forces::GeneralizedForce;
@@ -78,20 +79,21 @@ impl Field for PathForce {
     fn exert(&self, at: &Instant<'_>, take: Take<'_>) {
         let Moving { rate, resistance: (c, by_length), tension } = self.moving(at);
         let ends = || moving_ends(&self.segments, at.tree, at.poses);
+        // `L' = J · unit` and `L̇' = J̇ · unit + J · turned`.
+        let (mut unit, mut turned) = (Force::default(), Force::default());
+        for end in ends() {
+            let velocity = twist(at, end.of).at(end.point);
+            let relative = velocity - twist(at, end.base).at(end.base_point);
+            let carried = Force { n: velocity.cross(end.along), f: Vec3::ZERO };
+            unit = unit.plus(at_point(end.point, end.along));
+            turned = turned.plus(at_point(end.point, end.turned(relative))).plus(carried);
+        }
         for end in ends() {
             let force = end.along * tension;
             take(at_point(end.point, force), &|axis, axis_rate| {
-                let (mut longer, mut faster) = (0.0, 0.0);
-                for end in ends() {
-                    let velocity = twist(at, end.of).at(end.point);
-                    let relative = velocity - twist(at, end.base).at(end.base_point);
-                    let moved = axis.at(end.point);
-                    let accelerated = axis_rate.at(end.point) + axis.w.cross(velocity);
-                    longer += end.along.dot(moved);
-                    faster += end.turned(moved).dot(relative) + end.along.dot(accelerated);
-                }
                 let moved = axis.at(end.point);
-                let slacker = by_length * rate * longer + c * faster;
+                let faster = axis_rate.dot(unit) + axis.dot(turned);
+                let slacker = by_length * rate * axis.dot(unit) + c * faster;
                 let changed = end.turned(moved) * tension - end.along * slacker;
                 change_at_point([end.point, force], [moved, changed])
             });

@@ -8,6 +8,7 @@
 //! `T = V'(L)` and `k = V''(L)`.
 
 use plantd_math::scalar::Scalar;
+use plantd_math::spatial::Force;
 
 use crate::lagrangian::fields::{Field, Take, at_point, change_at_point};
 use crate::lagrangian::instant::Instant;
@@ -63,11 +64,14 @@ impl Field for PathSpring {
         let length = self.length(Place { tree, poses, q });
         let (tension, stiffness) = (self.law.tension(length), self.law.stiffness(length));
         let ends = || moving_ends(&self.segments, tree, poses);
+        // `L' = J · unit`.
+        let units = ends().map(|end| at_point(end.point, end.along));
+        let unit = units.fold(Force::default(), Force::plus);
         for end in ends() {
             let force = end.along * -tension;
             take(at_point(end.point, force), &|axis, _| {
-                let longer: f64 = ends().map(|end| end.along.dot(axis.at(end.point))).sum();
                 let moved = axis.at(end.point);
+                let longer = axis.dot(unit);
                 let changed = end.turned(moved) * -tension - end.along * (stiffness * longer);
                 change_at_point([end.point, force], [moved, changed])
             });
