@@ -57,6 +57,17 @@ impl Spline {
         all.all(|x| x.is_finite()).then_some(spline)
     }
 
+    /// A bound of the second derivative.
+    pub fn steepest(&self) -> f64 {
+        let widths = self.knots.windows(2).map(|ends| ends[1] - ends[0]);
+        let widths = std::iter::once(0.0).chain(widths).chain([0.0]);
+        let bounds = self.pieces.iter().zip(widths).map(|([_, _, a2, a3, a4, a5], width)| {
+            let rest = (20.0 * a5.abs() * width + 12.0 * a4.abs()) * width + 6.0 * a3.abs();
+            rest * width + 2.0 * a2.abs()
+        });
+        bounds.fold(0.0, f64::max)
+    }
+
     /// Index of the piece at `x`, and the distance from where it counts.
     #[inline]
     fn locate<S: Scalar>(&self, x: S) -> (usize, S) {

@@ -119,10 +119,11 @@ fn assemble(scene: &Scene, layout: Layout) -> Model {
     let is_moved = dynamics.joints.iter().any(|joint| joint.coordinate >= dynamic);
     let is_free = dimensions.constraints == 0;
     let goes_to_space =
-        needs_poses || (is_moved && is_free && Solver::is_deep(&elimination, Blocks::One));
+        needs_poses || (is_moved && is_free && Solver::is_deep(&elimination, (0, Blocks::One)));
     let planar = if goes_to_space { None } else { planar(&dynamics, gravity) };
     let mut model = Model {
-        field_ends: None,
+        acting: None,
+        foresees_elements: false,
         conditioning: Conditioning::default(),
         initial_violations: Vec::new(),
         dimensions,
@@ -153,7 +154,8 @@ fn assemble(scene: &Scene, layout: Layout) -> Model {
         scene: scene.clone(),
         warnings: Vec::new(),
     };
-    model.field_ends = model.find_field_ends();
+    model.acting = model.find_acting();
+    model.foresees_elements = model.is_generated_in_space() && !model.has_simple_elements();
     model.solver = Solver::of(&model);
     model.initial_violations = model.violations_at_start();
     model.conditioning = Conditioning::new(&model);

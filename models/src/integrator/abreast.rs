@@ -30,7 +30,7 @@ use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::mechanics::Kept;
 use crate::lagrangian::nudge::Nudge;
 use crate::lagrangian::planar::PlanarTree;
-use crate::model::mechanism::{CoordinateLaw, Forces, Model, Solver, Spring};
+use crate::model::mechanism::{CoordinateLaw, Forces, Model, Solver};
 
 /// The memory of a step of plants side by side.
 #[derive(Clone, Debug)]
@@ -198,8 +198,7 @@ impl Model {
             && d.prescribed == 0
             && d.constraints == 0
             && self.orientations.is_empty()
-            && self.forces.as_ref().is_none_or(Forces::go_abreast)
-            && self.potentials.springs.iter().all(Spring::is_linear)
+            && self.has_simple_elements()
             && self.signals.is_empty()
             && matches!(self.solver, Solver::Tree | Solver::Planar)
     }
@@ -207,7 +206,7 @@ impl Model {
 
 impl Forces {
     /// Whether none branches, and all are on single coordinates.
-    fn go_abreast(&self) -> bool {
+    pub(crate) fn go_abreast(&self) -> bool {
         let is_smooth = |law: &CoordinateLaw| {
             matches!(law, CoordinateLaw::Friction { .. } | CoordinateLaw::Constant(_))
         };
@@ -493,6 +492,7 @@ impl<const N: usize> Abreast<N> {
         mid.write_impulse(h, impulse);
         if is_nudged {
             nudge.move_on(model, &mut mid.mechanics, residual, h, |_| {}, impulse);
+            nudge.move_springs_on(model, h, impulse);
         }
         for (solved, now) in solved.iter_mut().zip([&*increment, &*impulse]) {
             for (solved, now) in solved.iter_mut().zip(now) {

@@ -23,15 +23,19 @@
 use plantd_math::scalar::Compared;
 use plantd_math::spatial::three;
 
+use crate::integrator::midpoint::Midpoint;
 use crate::integrator::report::StepReport;
 use crate::integrator::settings::{ForceSplit, Settings};
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::Workspace;
-use crate::kkt::system::Estimates;
+use crate::kkt::system::{Estimates, Recursion};
 use crate::lagrangian::arrangement::Planar;
+use crate::lagrangian::fields::OwnTorque;
+use crate::lagrangian::instant::Instant;
+use crate::lagrangian::kinematics::Place;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::nudge::Nudge;
-use crate::model::mechanism::{CoordinateSpring, Model, Spring};
+use crate::model::mechanism::{CoordinateSpring, Forces, LinearSpring, Model, Spring};
 
 /// What may be left of the residual unseen, in units of its round-off, as it is estimated.
 const UNSEEN: f64 = 0.5;
@@ -92,22 +96,39 @@ impl Model {
         self.forces.is_none() && springs.all(|spring| matches!(spring, Spring::Coordinate(_)))
     }
 
-    /// Whether bodies are all there is: then the estimate holds, and the impulse has a derivative
-    /// that is as cheap as a correction.
+    /// Whether springs and forces are such as plants side by side have: linear springs, dry friction and constant
+    /// forces, all on coordinates.
+    pub(crate) fn has_simple_elements(&self) -> bool {
+        self.forces.as_ref().is_none_or(Forces::go_abreast)
+            && self.potentials.springs.iter().all(Spring::is_linear)
+    }
+
+    /// Whether the end of steps is foreseen: of bodies and linear springs of coordinates, where the impulse has a
+    /// derivative that is as cheap as a correction; and of all that generators have, with equal halves of forces.
     ///
     /// Of springs that swing faster than a radian a step, the impulse of a guess is so much larger than that of the
     /// solution that its round-off shows.
     pub(crate) fn is_foreseen(&self, settings: &Settings) -> bool {
         let (square, inertia) = (settings.time_step_s.powi(2), &self.conditioning.inertia);
+        let is_slow = |i: &usize, stiffness: f64| {
+            inertia.get(*i).is_none_or(|inertia| stiffness * square <= *inertia)
+        };
         let is_soft = |spring: &Spring| match spring {
             Spring::Coordinate(CoordinateSpring { coordinate, stiffness, .. }) => {
-                inertia.get(*coordinate).is_none_or(|inertia| stiffness * square <= *inertia)
+                is_slow(coordinate, *stiffness)
             }
-            _ => false,
+            Spring::Linear(LinearSpring { terms, stiffness, .. }) => {
+                terms.iter().all(|(i, c)| is_slow(i, stiffness * c * c))
+            }
+            _ => true,
         };
-        self.forces.is_none()
-            && self.potentials.springs.iter().all(is_soft)
-            && (self.orientations.is_empty() || settings.force_split == ForceSplit::Symmetric)
+        let is_symmetric = settings.force_split == ForceSplit::Symmetric;
+        let has_derivative = if self.is_of_bodies() {
+            self.orientations.is_empty() || is_symmetric
+        } else {
+            is_symmetric && self.foresees_elements
+        };
+        has_derivative && self.potentials.springs.iter().all(is_soft)
     }
 }
 
@@ -142,6 +163,11 @@ impl<S: Planar> Nudge<S> {
         for ((impulse, c), x) in impulse.iter_mut().zip(&model.damping).zip(corrections) {
             *impulse += *x * *c;
         }
+    }
+
+    /// The same of linear springs on coordinates, where nothing else acts.
+    #[inline(always)]
+    pub(crate) fn move_springs_on(&self, model: &Model, h: f64, impulse: &mut [S]) {
         for spring in &model.potentials.springs {
             let Spring::Coordinate(CoordinateSpring { coordinate: i, stiffness, .. }) = spring
             else {
@@ -158,9 +184,17 @@ impl Workspace {
     /// What the last correction leaves of the residual, in units of its round-off.
     #[inline(never)]
     pub(crate) fn foresee(&self, model: &Model, settings: &Settings, strayed: &mut Strayed) -> f64 {
-        let unit = f64::EPSILON * self.residual.round_off * settings.time_step_s.abs();
+        let (h, round_off) = (settings.time_step_s, f64::EPSILON * self.residual.round_off);
         let (corrections, inertia) = (&self.residual.dynamics, &model.conditioning.inertia);
-        strayed.left(corrections, &self.step.increment, inertia, unit)
+        let before = strayed.turned;
+        let unit = round_off * h.abs();
+        let left = strayed.left(corrections, &self.step.increment, inertia, unit);
+        if model.is_of_bodies() || left > BORNE_OUT {
+            return left;
+        }
+        // `α_y α + α_y α + α²`.
+        let square = strayed.turned.powi(2) - before.powi(2);
+        left + square * (0.25 * h * self.mid.curve(model, h)).abs() / round_off
     }
 
     /// Whether the constraints hold where the last correction leads; if they do, what the next step begins with is
@@ -186,7 +220,8 @@ impl Workspace {
         holds
     }
 
-    /// Moves the impulse on by the last correction, at the last factorization.
+    /// Moves the impulse on by the last correction, at the last factorization; but for
+    /// [what is not of bodies](Self::nudge_elements).
     #[inline(never)]
     pub(crate) fn nudge_impulse(&mut self, model: &Model, settings: &Settings) {
         let h = settings.time_step_s;
@@ -203,6 +238,9 @@ impl Workspace {
             }
         };
         nudge.move_on(model, &mut mid.mechanics, corrections, h, turn, &mut step.impulse);
+        if model.is_of_bodies() {
+            nudge.move_springs_on(model, h, &mut step.impulse);
+        }
         if model.orientations.is_empty() {
             return;
         }
@@ -217,6 +255,57 @@ impl Workspace {
                 *impulse += change;
             }
         }
+    }
+
+    /// Moves the impulse on by what springs and forces make of the change that [`Self::nudge_impulse`] has moved it by,
+    /// with equal halves.
+    #[inline(never)]
+    pub(crate) fn nudge_elements(&mut self, model: &Model, h: f64) {
+        let Self { step, mid, kkt, nudge, .. } = self;
+        let Nudge { position, velocity, .. } = nudge;
+        let (impulse, at) = (&mut step.impulse[..], mid.instant(model));
+        let nd = impulse.len();
+        let mut add = |i: usize, j: usize, by_q: f64, by_v: f64| {
+            if i < nd && j < nd {
+                impulse[i] += h * (by_q * position[j] + by_v * velocity[j]);
+            }
+        };
+        if !matches!(kkt.factored.recursion, Recursion::Spatial(_)) {
+            model.for_each_spring_derivative(at.poses, at.q, |i, j, value| add(i, j, -value, 0.0));
+            if let Some(forces) = &model.forces {
+                forces.for_each_derivative(&at, add);
+            }
+            return;
+        }
+        model.for_each_own_spring_derivative(at.poses, at.q, |i, value| add(i, i, -value, 0.0));
+        if let Some(forces) = &model.forces {
+            forces.for_each_own_derivative(&at, |i, by_q, by_v| add(i, i, by_q, by_v));
+        }
+        mid.for_each_own_torque(model, (kkt.fields.as_deref(), 1.0), |o, own| {
+            let first = model.orientations[o];
+            for (row, column) in (0..9).map(|entry| (entry / 3, entry % 3)) {
+                let OwnTorque { by_turn, by_velocity } = own;
+                let [by_q, by_v] = [by_turn, by_velocity].map(|by| by.0[column][row]);
+                add(first + row, first + column, by_q, by_v);
+            }
+        });
+        if let Some(fields) = &mut kkt.fields {
+            let curvature = &mid.mechanics.curvature;
+            fields.add_change(model, curvature, [position, velocity], h, impulse);
+        }
+    }
+}
+
+impl Midpoint {
+    /// A bound of the second derivative of `L_q + f` along changes of the increment whose magnitudes sum up to one, as
+    /// far as springs and forces make it.
+    fn curve(&self, model: &Model, h: f64) -> f64 {
+        let (at, moved) = (self.instant(model), 0.5);
+        let Instant { tree, poses, q, .. } = at;
+        let springs = model.third_spring_derivative(Place { tree, poses, q });
+        let forces =
+            model.forces.iter().map(|forces| forces.second_derivative(&at, [moved, 1.0 / h.abs()]));
+        moved * moved * springs + forces.sum::<f64>()
     }
 }
 
@@ -289,6 +378,121 @@ mod tests {
             }
         }
         assert!(unseen > 250, "{unseen}");
+    }
+
+    /// A walker that is pulled, pushed and braked: from the world, between its hull and a foot, and at joints.
+    const PULLED: &str = r#"
+[[springs]]
+type = "two_point"
+a = { frame = "foot0", at = [0.0, 0.1, -0.2] }
+b = { frame = "world", at = [0.5, 0.0, -1.5] }
+stiffness = 40.0
+rest_length = 0.5
+[[springs]]
+type = "two_point"
+a = { frame = "hull", at = [0.0, 0.1, 0.2] }
+b = { frame = "foot2" }
+stiffness = 20.0
+[[springs]]
+type = "path"
+points = [{ frame = "hull", at = [0.1, 0.0, 0.2] }, { frame = "foot2" }, { frame = "hull" }]
+stiffness = 10.0
+rest_length = 0.3
+[[springs]]
+type = "orientation"
+frame = "hull"
+stiffness = 5.0
+[[springs]]
+type = "stop"
+coordinate = "knee1"
+range = [-0.1, 0.1]
+stiffness = 30.0
+damping = 2.0
+transition = 0.3
+[[springs]]
+type = "spline"
+coordinate = "knee2"
+knots = [{ x = -1.0, value = 2.0 }, { x = 0.0, value = 0.0 }, { x = 1.0, value = -3.0 }]
+[[forces]]
+type = "body_wrench"
+frame = "foot1"
+force = [0.3, 0.0, 2.0]
+torque = [0.0, 0.1, 0.2]
+[[forces]]
+type = "hybrid_wrench"
+frame = "hull"
+force = [0.3, 0.0, 20.0]
+torque = [0.0, 0.0, 0.0]
+[[forces]]
+type = "drag"
+frame = "foot1"
+coefficient = 0.5
+[[forces]]
+type = "two_point_damper"
+a = { frame = "hull" }
+b = { frame = "foot2", at = [0.0, 0.0, -0.3] }
+damping = 1.5
+[[forces]]
+type = "path_damper"
+points = [{ frame = "hull", at = [0.1, 0.0, 0.2] }, { frame = "foot2" }]
+damping = 0.5
+[[forces]]
+type = "friction"
+coordinate = "hip3"
+force = 0.5
+velocity = 0.3
+[[forces]]
+type = "coordinate_drag"
+coordinate = "hip2"
+coefficient = 0.2
+cubic = 0.1
+"#;
+
+    /// The same with what acts on bodies, by generators and entry by entry; and the motion is that of steps of which all
+    /// are looked at.
+    #[test]
+    fn what_elements_leave_unseen_is_round_off() {
+        for is_generated in [true, false] {
+            let text = builtin::scene("walker-4").unwrap().to_toml() + PULLED;
+            let scene = plantd_scene::Scene::from_toml(&text).unwrap();
+            let [mut plant, mut looked_at] = [true, false].map(|foresees| {
+                let mut model = Model::compile(&scene).unwrap();
+                model.solver = if is_generated { Solver::Spatial } else { Solver::Tree };
+                model.foresees_elements &= foresees;
+                let settings = Settings { time_step_s: 0.002, ..Settings::new(&model) };
+                Plant::new(Arc::new(model), settings).unwrap()
+            });
+            let settings = plant.settings;
+            let n = plant.model.dimensions.coordinates();
+            let q = plant.state.q.clone();
+            let v: Vec<f64> = (0..n).map(|i| (1.7 * i as f64).sin()).collect();
+            for plant in [&mut plant, &mut looked_at] {
+                plant.initialize(&Initial::Velocity { q: q.clone(), v: v.clone() }).unwrap();
+            }
+            let u = vec![0.3; plant.model.dimensions.input()];
+            let mut unseen = 0;
+            for _ in 0..200 {
+                looked_at.step(&u).unwrap();
+                plant.solve(&u, None).unwrap();
+                let Plant { model, state, workspace, .. } = &mut plant;
+                if !workspace.step.is_evaluated {
+                    unseen += 1;
+                    let impulse = workspace.step.impulse.clone();
+                    let size = workspace.evaluate(model, &settings, state);
+                    workspace.find_impulse(model, &settings);
+                    let apart: Vec<f64> =
+                        impulse.iter().zip(&workspace.step.impulse).map(|(a, b)| a - b).collect();
+                    let apart = largest(&apart) / (f64::EPSILON * workspace.residual.round_off);
+                    assert!(size < 64.0 && apart < 1.0, "{size} {apart}");
+                }
+                plant.commit();
+            }
+            assert!(unseen > 100, "{unseen}");
+            for (a, b) in [(plant.q(), looked_at.q()), (plant.p(), looked_at.p())] {
+                let apart: Vec<f64> = a.iter().zip(b).map(|(a, b)| a - b).collect();
+                assert!(largest(&apart) < 1e-11, "{:e}", largest(&apart));
+            }
+        }
     }
 
     /// The same with constraints, which hold where nobody looked at the rest.

@@ -116,8 +116,8 @@ impl Workspace {
         if at.model.is_of_bodies() { self.solve_as::<true>(at) } else { self.solve_as::<false>(at) }
     }
 
-    /// `BODIES`: whether the model is one of bodies ([`Model::is_of_bodies`]). All others have no push and no end
-    /// that is foreseen, and nothing of these in their steps.
+    /// `BODIES`: whether the model is one of bodies ([`Model::is_of_bodies`]). All others have no push, and
+    /// nothing of it in their steps.
     fn solve_as<const BODIES: bool>(&mut self, at: StepContext<'_>) -> Result<(), StepError> {
         let StepContext { model, settings, state, .. } = at;
         self.prepare(at);
@@ -269,7 +269,7 @@ impl Workspace {
     ) -> Result<(), StepError> {
         let mut report = StepReport::default();
         let mut chord = Chord::<f64>::new(settings, self.kkt.corrections(), always_factor);
-        let mut strayed = (BODIES && model.is_foreseen(settings)).then(Strayed::default);
+        let mut strayed = model.is_foreseen(settings).then(Strayed::default);
         let pushes = BODIES && !state.past.point.is_empty();
         loop {
             if report.iterations == settings.max_iterations {
@@ -324,7 +324,7 @@ impl Workspace {
             chord.is_idle = self.is_round_off_of_coordinates();
         }
         // Accept: p1 = D2Ld + F⁺.
-        self.accept::<BODIES>(model, settings, report)
+        self.accept(model, settings, report)
     }
 
     /// Constraint values `r2` at the current increment; returns their size in units of round-off.
@@ -368,7 +368,7 @@ impl Workspace {
     }
 
     /// Checks the solution, and finds its impulse.
-    fn accept<const BODIES: bool>(
+    fn accept(
         &mut self,
         model: &Model,
         settings: &Settings,
@@ -376,8 +376,11 @@ impl Workspace {
     ) -> Result<(), StepError> {
         model.check_turns(&self.step.increment)?;
         self.find_impulse(model, settings);
-        if BODIES && !self.step.is_evaluated {
+        if !self.step.is_evaluated {
             self.nudge_impulse(model, settings);
+            if !model.is_of_bodies() {
+                self.nudge_elements(model, settings.time_step_s);
+            }
         }
         if model.dimensions.constraints > 0 {
             // The extrapolated guess has the least norm of other configurations.

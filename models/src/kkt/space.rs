@@ -43,7 +43,7 @@ use crate::lagrangian::curvature::Curvature;
 use crate::lagrangian::fields::Fields;
 use crate::lagrangian::generators::{Generators, MatrixKind, Step};
 use crate::lagrangian::turning::Weights;
-use crate::model::mechanism::{Blocks, Model};
+use crate::model::mechanism::{Acting, Blocks, Model};
 use crate::model::tree::{JointKind, Tree};
 
 /// Axes that are eliminated at once, at most.
@@ -95,6 +95,9 @@ struct Limb {
     /// Where the sums of the limbs are that hang from its lowest joint.
     carries: Option<usize>,
     hangs_from: Option<Fork>,
+    /// Whether something acts across its joints. Where nothing does, all blocks but the first are zero, and nobody looks
+    /// at them.
+    is_acted_on: bool,
 }
 
 /// Where limbs meet.
@@ -181,8 +184,9 @@ impl<E: Eight, const B: usize> Sums<E, B> {
         Self { rows: [[InLine::ZERO; 8]; B], columns: [[InLine::ZERO; 8]; B] }
     }
 
+    /// The first blocks of what has more.
     #[inline(always)]
-    fn of([rows, columns]: &Kept<B>) -> Self {
+    fn of<const L: usize>([rows, columns]: &Kept<L>) -> Self {
         let mut sums = Self::zero();
         for b in 0..B {
             for k in 0..8 {
@@ -216,8 +220,9 @@ impl<E: Eight, const B: usize> Sums<E, B> {
         }
     }
 
+    /// To the first blocks of what has more.
     #[inline(always)]
-    fn put(&self, [rows, columns]: &mut Kept<B>) {
+    fn put<const L: usize>(&self, [rows, columns]: &mut Kept<L>) {
         for b in 0..B {
             for k in 0..8 {
                 self.rows[b][k].put(&mut rows[b][k]);
@@ -270,7 +275,7 @@ fn inverse<const W: usize>(d: &[[f64; W]; W]) -> ([[f64; W]; W], [f64; W]) {
 }
 
 /// Limbs and groups in the order of their elimination, and how many places of sums there are.
-fn limbs(tree: &Tree, nd: usize, field_ends: &[bool]) -> (Vec<Limb>, Vec<Group>, usize) {
+fn limbs(tree: &Tree, nd: usize, acting: &[Acting]) -> (Vec<Limb>, Vec<Group>, usize) {
     let joints = &tree.joints[..];
     let mut children = vec![0; joints.len()];
     // Behind the last axis below each.
@@ -282,16 +287,18 @@ fn limbs(tree: &Tree, nd: usize, field_ends: &[bool]) -> (Vec<Limb>, Vec<Group>,
         }
     }
     // Forks on the way to each joint, which are the places of its own one: what is below a joint is done
-    // with before the next one needs the place.
-    let mut forks = vec![0; joints.len()];
-    for joint in joints {
+    // with before the next one needs the place. Where elements begin to act, limbs meet, too.
+    let is_acted_on = |i: usize| acting.get(i).is_some_and(|acting| *acting != Acting::Nothing);
+    let (mut forks, mut is_fork) = (vec![0; joints.len()], vec![false; joints.len()]);
+    for (i, joint) in joints.iter().enumerate() {
         if let Some(count) = children.get_mut(joint.parent) {
             *count += 1;
+            is_fork[joint.parent] |= *count > 1 || is_acted_on(i) != is_acted_on(joint.parent);
         }
     }
     for (i, joint) in joints.iter().enumerate() {
-        if let Some(&count) = children.get(joint.parent) {
-            forks[i] = forks[joint.parent] + usize::from(count > 1);
+        if let Some(is_fork) = is_fork.get(joint.parent) {
+            forks[i] = forks[joint.parent] + usize::from(*is_fork);
         }
     }
     let (mut limbs, mut groups, mut seen) = (Vec::new(), Vec::new(), vec![false; joints.len()]);
@@ -299,12 +306,12 @@ fn limbs(tree: &Tree, nd: usize, field_ends: &[bool]) -> (Vec<Limb>, Vec<Group>,
     while end > 0 {
         let lowest = end - 1;
         let mut top = lowest;
-        while joints[top].follows(top) && children[top - 1] == 1 {
+        while joints[top].follows(top) && !is_fork[top - 1] {
             top -= 1;
         }
         let parent = joints[top].parent;
         let begin = groups.len();
-        gather(tree, top..end, (nd, field_ends), &mut groups);
+        gather(tree, top..end, (nd, acting), &mut groups);
         for group in &mut groups[begin..] {
             for joint in &joints[group.axes.start..ends[lowest]] {
                 let i = joint.coordinate;
@@ -317,11 +324,12 @@ fn limbs(tree: &Tree, nd: usize, field_ends: &[bool]) -> (Vec<Limb>, Vec<Group>,
         }
         limbs.push(Limb {
             groups: begin..groups.len(),
-            carries: (children[lowest] > 1).then_some(forks[lowest]),
+            carries: is_fork[lowest].then_some(forks[lowest]),
             hangs_from: seen.get_mut(parent).map(|seen| Fork {
                 place: forks[parent],
                 is_first: !std::mem::replace(seen, true),
             }),
+            is_acted_on: is_acted_on(lowest),
         });
         end = top;
     }
@@ -332,10 +340,10 @@ fn limbs(tree: &Tree, nd: usize, field_ends: &[bool]) -> (Vec<Limb>, Vec<Group>,
 fn gather(
     tree: &Tree,
     axes: Range<usize>,
-    (nd, field_ends): (usize, &[bool]),
+    (nd, acting): (usize, &[Acting]),
     groups: &mut Vec<Group>,
 ) {
-    let ends = |i: usize| field_ends.get(i).is_some_and(|is_end| *is_end);
+    let ends = |i: usize| acting.get(i) == Some(&Acting::Ends);
     let kind = |i: usize| {
         let joint = &tree.joints[i];
         let ball = matches!(joint.kind, JointKind::Ball(_)).then_some(joint.orientation);
@@ -374,8 +382,8 @@ fn gather(
 impl<const B: usize> SpatialRecursion<B> {
     pub(crate) fn new(model: &Model) -> Self {
         let joints = model.dynamics.joints.len();
-        let field_ends = model.field_ends.as_deref().unwrap_or_default();
-        let (limbs, groups, places) = limbs(&model.dynamics, model.dimensions.dynamic, field_ends);
+        let acting = model.acting.as_deref().unwrap_or_default();
+        let (limbs, groups, places) = limbs(&model.dynamics, model.dimensions.dynamic, acting);
         Self {
             within: vec![[[0.0; WIDEST]; WIDEST]; groups.len()],
             limbs,
@@ -431,26 +439,33 @@ impl<const B: usize> Factor<'_, B> {
 
 /// Looks at groups before they are eliminated.
 trait Watch<E, const B: usize> {
-    /// At the generators of a group, and at `A` where it is not zero.
-    fn see(
+    /// At the generators of a group, of which `U` blocks are used, and at `A` where it is not zero.
+    fn see<const U: usize>(
         &mut self,
         at: usize,
         group: &Group,
         axes: &[Generators<Line<B>>],
-        sums: Option<&Sums<E, B>>,
+        sums: Option<&Sums<E, U>>,
     );
 }
 
 /// Nobody looks.
 impl<E, const B: usize> Watch<E, B> for () {
     #[inline(always)]
-    fn see(&mut self, _: usize, _: &Group, _: &[Generators<Line<B>>], _: Option<&Sums<E, B>>) {}
+    fn see<const U: usize>(
+        &mut self,
+        _: usize,
+        _: &Group,
+        _: &[Generators<Line<B>>],
+        _: Option<&Sums<E, U>>,
+    ) {
+    }
 }
 
 impl<E: Eight, const B: usize> Generators<InLine<E, B>> {
     /// To memory.
     #[inline(always)]
-    fn put_lines(self, to: &mut Generators<Line<B>>) {
+    fn put_lines<const L: usize>(self, to: &mut Generators<Line<L>>) {
         self.minus.put(&mut to.minus);
         self.plus.put(&mut to.plus);
         self.upper.put(&mut to.upper);
@@ -462,14 +477,26 @@ impl<const B: usize> SpatialRecursion<B> {
     /// Writes the vectors of all axes, and `K` of each group.
     #[inline(always)]
     fn generate<E: Eight>(&mut self, vectors: &Vectors<'_>) {
-        let added = &vectors.added;
-        for (group, within) in self.groups.iter().zip(&mut self.within) {
+        for limb in 0..self.limbs.len() {
+            if B > 1 && self.limbs[limb].is_acted_on {
+                self.generate_limb::<E, B>(limb, vectors);
+            } else {
+                self.generate_limb::<E, 1>(limb, vectors);
+            }
+        }
+    }
+
+    /// The same of a limb whose vectors have `U` blocks of use.
+    #[inline(always)]
+    fn generate_limb<E: Eight, const U: usize>(&mut self, limb: usize, vectors: &Vectors<'_>) {
+        let (added, range) = (&vectors.added, self.limbs[limb].groups.clone());
+        for (group, within) in self.groups[range.clone()].iter().zip(&mut self.within[range]) {
             let (range, first) = (group.axes.clone(), group.axes.start);
             let axes = &mut self.axes[range.clone()];
             match group.kind {
                 GroupKind::Single => {}
                 GroupKind::Ball(ball) => {
-                    let (generators, own) = vectors.ball::<E, B>(first, &added.balls[ball]);
+                    let (generators, own) = vectors.ball::<E, U>(first, &added.balls[ball]);
                     for (axis, own) in axes.iter_mut().zip(generators) {
                         own.put_lines(axis);
                     }
@@ -479,13 +506,13 @@ impl<const B: usize> SpatialRecursion<B> {
                 GroupKind::Prescribed(_) => continue,
             }
             for (i, axis) in range.zip(&mut *axes) {
-                vectors.single::<E, B>(i).put_lines(axis);
+                vectors.single::<E, U>(i).put_lines(axis);
             }
             let diagonal = &added.diagonal[group.rows.clone()];
             match *axes {
-                [ref a] => write_within::<E, B, 1>([a], diagonal, within),
-                [ref a, ref b] => write_within::<E, B, 2>([a, b], diagonal, within),
-                [ref a, ref b, ref c] => write_within::<E, B, 3>([a, b, c], diagonal, within),
+                [ref a] => write_within::<E, B, U, 1>([a], diagonal, within),
+                [ref a, ref b] => write_within::<E, B, U, 2>([a, b], diagonal, within),
+                [ref a, ref b, ref c] => write_within::<E, B, U, 3>([a, b, c], diagonal, within),
                 _ => {}
             }
         }
@@ -499,54 +526,75 @@ impl<const B: usize> SpatialRecursion<B> {
         watch: &mut impl Watch<E, B>,
     ) -> SmallestPivot {
         let mut smallest = SmallestPivot::NONE;
-        for limb in &self.limbs {
-            let mut sums = match limb.carries {
-                Some(place) => Sums::<E, B>::of(&self.sums[place]),
-                None => Sums::zero(),
-            };
-            let mut carries = limb.carries.is_some();
-            for at in limb.groups.clone() {
-                let (group, within) = (&self.groups[at], &mut self.within[at]);
-                let first = group.rows.start;
-                let see = |axis: usize, pivot: f64, entry: f64| {
-                    smallest.see(first + axis, pivot, entry.abs().max(inertia(first + axis)));
-                };
-                let is_root = limb.hangs_from.is_none() && at + 1 == limb.groups.end;
-                let axes = &self.axes[group.axes.clone()];
-                watch.see(at, group, axes, carries.then_some(&sums));
-                if !matches!(group.kind, GroupKind::Prescribed(_)) {
-                    let sums = &mut sums;
-                    match &mut self.axes[group.axes.clone()] {
-                        [a] => eliminate([a], within, sums, carries, is_root, see),
-                        [a, b] => eliminate([a, b], within, sums, carries, is_root, see),
-                        [a, b, c] => eliminate([a, b, c], within, sums, carries, is_root, see),
-                        _ => {}
-                    }
-                    carries = true;
-                }
-                if B > 1 && group.is_end {
-                    sums.end();
-                }
-            }
-            if let Some(Fork { place, is_first }) = limb.hangs_from {
-                let all = &mut self.sums[place];
-                let sums = if is_first { sums } else { sums.plus(&Sums::of(all)) };
-                sums.put(all);
+        for limb in 0..self.limbs.len() {
+            if B > 1 && self.limbs[limb].is_acted_on {
+                self.eliminate_limb::<E, B>(limb, &inertia, watch, &mut smallest);
+            } else {
+                self.eliminate_limb::<E, 1>(limb, &inertia, watch, &mut smallest);
             }
         }
         smallest
+    }
+
+    /// The same of a limb whose vectors have `U` blocks of use.
+    #[inline(always)]
+    fn eliminate_limb<E: Eight, const U: usize>(
+        &mut self,
+        limb: usize,
+        inertia: &impl Fn(usize) -> f64,
+        watch: &mut impl Watch<E, B>,
+        smallest: &mut SmallestPivot,
+    ) {
+        let limb = &self.limbs[limb];
+        let mut sums = match limb.carries {
+            Some(place) => Sums::<E, U>::of(&self.sums[place]),
+            None => Sums::zero(),
+        };
+        let mut carries = limb.carries.is_some();
+        for at in limb.groups.clone() {
+            let (group, within) = (&self.groups[at], &mut self.within[at]);
+            let first = group.rows.start;
+            let see = |axis: usize, pivot: f64, entry: f64| {
+                smallest.see(first + axis, pivot, entry.abs().max(inertia(first + axis)));
+            };
+            let is_root = limb.hangs_from.is_none() && at + 1 == limb.groups.end;
+            let axes = &self.axes[group.axes.clone()];
+            watch.see(at, group, axes, carries.then_some(&sums));
+            if !matches!(group.kind, GroupKind::Prescribed(_)) {
+                let sums = &mut sums;
+                match &mut self.axes[group.axes.clone()] {
+                    [a] => eliminate([a], within, sums, carries, is_root, see),
+                    [a, b] => eliminate([a, b], within, sums, carries, is_root, see),
+                    [a, b, c] => eliminate([a, b, c], within, sums, carries, is_root, see),
+                    _ => {}
+                }
+                carries = true;
+            }
+            if U > 1 && group.is_end {
+                sums.end();
+            }
+        }
+        if let Some(Fork { place, is_first }) = limb.hangs_from {
+            let all = &mut self.sums[place];
+            if !is_first {
+                sums = sums.plus(&Sums::of(all));
+            } else if U < B {
+                *all = [[[Line::ZERO; 8]; B]; 2];
+            }
+            sums.put(all);
+        }
     }
 }
 
 /// `K` of hinges, slides and screws one below the other.
 #[inline(always)]
-fn write_within<E: Eight, const B: usize, const W: usize>(
+fn write_within<E: Eight, const B: usize, const U: usize, const W: usize>(
     axes: [&Generators<Line<B>>; W],
     diagonal: &[f64],
     within: &mut Square,
 ) {
     for (a, above) in axes.iter().enumerate() {
-        let (minus, plus) = (InLine::<E, B>::of(&above.minus), InLine::<E, B>::of(&above.plus));
+        let (minus, plus) = (InLine::<E, U>::of(&above.minus), InLine::<E, B>::of(&above.plus));
         within[a][a] = minus.dot(InLine::of(&above.upper)) + diagonal[a];
         for (b, below) in axes.iter().enumerate().skip(a + 1) {
             within[a][b] = minus.dot(InLine::of(&below.upper));
@@ -557,16 +605,16 @@ fn write_within<E: Eight, const B: usize, const W: usize>(
 
 /// Eliminates the axes of a group; `see` takes an axis, its pivot, and what stands in `K` in its place.
 #[inline(always)]
-fn eliminate<E: Eight, const B: usize, const W: usize>(
+fn eliminate<E: Eight, const B: usize, const U: usize, const W: usize>(
     axes: [&mut Generators<Line<B>>; W],
     within: &mut Square,
-    sums: &mut Sums<E, B>,
+    sums: &mut Sums<E, U>,
     carries: bool,
     is_root: bool,
     mut see: impl FnMut(usize, f64, f64),
 ) {
     let mut d = [[0.0; W]; W];
-    let [mut u, mut w] = [[InLine::<E, B>::ZERO; W]; 2];
+    let [mut u, mut w] = [[InLine::<E, U>::ZERO; W]; 2];
     for a in 0..W {
         d[a].copy_from_slice(&within[a][..W]);
         u[a] = InLine::of(&axes[a].upper);
@@ -586,7 +634,7 @@ fn eliminate<E: Eight, const B: usize, const W: usize>(
     for a in (0..W).rev() {
         see(a, pivots[a], within[a][a]);
     }
-    let mut w_over_d = [InLine::<E, B>::ZERO; W];
+    let mut w_over_d = [InLine::<E, U>::ZERO; W];
     for a in 0..W {
         w_over_d[a] = w[0].scaled(inverse[a][0]);
         for b in 1..W {
@@ -602,7 +650,7 @@ fn eliminate<E: Eight, const B: usize, const W: usize>(
     for a in 0..W {
         // Number by number from memory, where compilers would take the registers apart.
         let axis: &Generators<Line<B>> = black_box(&*axes[a]);
-        for b in 0..B {
+        for b in 0..U {
             let (rows, columns) = (&mut sums.rows[b], &mut sums.columns[b]);
             for k in 0..8 {
                 rows[k] = rows[k].minus(w_over_d[a].scaled(axis.upper.0[b].0[k]));
@@ -639,8 +687,13 @@ struct Limbs<'a> {
 }
 
 /// What a group of axes makes of the flow that comes to it, from below or from above.
-trait Passage<E, const B: usize> {
-    fn pass(&mut self, at: usize, group: &Group, flow: InLine<E, B>) -> InLine<E, B>;
+trait Passage<E> {
+    fn pass<const U: usize>(
+        &mut self,
+        at: usize,
+        group: &Group,
+        flow: InLine<E, U>,
+    ) -> InLine<E, U>;
 }
 
 impl Limbs<'_> {
@@ -649,24 +702,13 @@ impl Limbs<'_> {
     fn ascend<E: Eight, const B: usize>(
         self,
         flows: &mut [Line<B>],
-        through: &mut impl Passage<E, B>,
+        through: &mut impl Passage<E>,
     ) {
         for limb in self.limbs {
-            let mut flow = match limb.carries {
-                Some(place) => InLine::<E, B>::of(&flows[place]),
-                None => InLine::ZERO,
-            };
-            for at in limb.groups.clone() {
-                let group = &self.groups[at];
-                flow = through.pass(at, group, flow);
-                if B > 1 && group.is_end {
-                    flow = flow.ended();
-                }
-            }
-            if let Some(Fork { place, is_first }) = limb.hangs_from {
-                let all = &mut flows[place];
-                let flow = if is_first { flow } else { flow.plus(InLine::of(all)) };
-                flow.put(all);
+            if B > 1 && limb.is_acted_on {
+                self.ascend_limb::<E, B, B>(limb, flows, through);
+            } else {
+                self.ascend_limb::<E, B, 1>(limb, flows, through);
             }
         }
     }
@@ -676,23 +718,67 @@ impl Limbs<'_> {
     fn descend<E: Eight, const B: usize>(
         self,
         flows: &mut [Line<B>],
-        through: &mut impl Passage<E, B>,
+        through: &mut impl Passage<E>,
     ) {
         for limb in self.limbs.iter().rev() {
-            let mut flow = match limb.hangs_from {
-                Some(fork) => InLine::<E, B>::of(&flows[fork.place]),
-                None => InLine::ZERO,
-            };
-            for at in limb.groups.clone().rev() {
-                let group = &self.groups[at];
-                if B > 1 && group.is_end {
-                    flow = flow.ended();
-                }
-                flow = through.pass(at, group, flow);
+            if B > 1 && limb.is_acted_on {
+                self.descend_limb::<E, B, B>(limb, flows, through);
+            } else {
+                self.descend_limb::<E, B, 1>(limb, flows, through);
             }
-            if let Some(place) = limb.carries {
-                flow.put(&mut flows[place]);
+        }
+    }
+
+    /// Up a limb whose vectors have `U` blocks of use.
+    #[inline(always)]
+    fn ascend_limb<E: Eight, const B: usize, const U: usize>(
+        self,
+        limb: &Limb,
+        flows: &mut [Line<B>],
+        through: &mut impl Passage<E>,
+    ) {
+        let mut flow = match limb.carries {
+            Some(place) => InLine::<E, U>::of(&flows[place]),
+            None => InLine::ZERO,
+        };
+        for at in limb.groups.clone() {
+            let group = &self.groups[at];
+            flow = through.pass(at, group, flow);
+            if U > 1 && group.is_end {
+                flow = flow.ended();
             }
+        }
+        if let Some(Fork { place, is_first }) = limb.hangs_from {
+            let all = &mut flows[place];
+            if is_first {
+                flow.put_alone(all);
+            } else {
+                flow.plus(InLine::of(all)).put(all);
+            }
+        }
+    }
+
+    /// Down a limb.
+    #[inline(always)]
+    fn descend_limb<E: Eight, const B: usize, const U: usize>(
+        self,
+        limb: &Limb,
+        flows: &mut [Line<B>],
+        through: &mut impl Passage<E>,
+    ) {
+        let mut flow = match limb.hangs_from {
+            Some(fork) => InLine::<E, U>::of(&flows[fork.place]),
+            None => InLine::ZERO,
+        };
+        for at in limb.groups.clone().rev() {
+            let group = &self.groups[at];
+            if U > 1 && group.is_end {
+                flow = flow.ended();
+            }
+            flow = through.pass(at, group, flow);
+        }
+        if let Some(place) = limb.carries {
+            flow.put(&mut flows[place]);
         }
     }
 }
@@ -704,9 +790,14 @@ struct Lift<'a, const B: usize> {
     x: &'a mut [f64],
 }
 
-impl<E: Eight, const B: usize> Passage<E, B> for Lift<'_, B> {
+impl<E: Eight, const B: usize> Passage<E> for Lift<'_, B> {
     #[inline(always)]
-    fn pass(&mut self, at: usize, group: &Group, flow: InLine<E, B>) -> InLine<E, B> {
+    fn pass<const U: usize>(
+        &mut self,
+        at: usize,
+        group: &Group,
+        flow: InLine<E, U>,
+    ) -> InLine<E, U> {
         let Group { axes, rows, kind, .. } = group;
         if matches!(kind, GroupKind::Prescribed(_)) {
             return flow;
@@ -727,9 +818,14 @@ struct Lower<'a, const B: usize> {
     x: &'a mut [f64],
 }
 
-impl<E: Eight, const B: usize> Passage<E, B> for Lower<'_, B> {
+impl<E: Eight, const B: usize> Passage<E> for Lower<'_, B> {
     #[inline(always)]
-    fn pass(&mut self, _: usize, group: &Group, flow: InLine<E, B>) -> InLine<E, B> {
+    fn pass<const U: usize>(
+        &mut self,
+        _: usize,
+        group: &Group,
+        flow: InLine<E, U>,
+    ) -> InLine<E, U> {
         let Group { axes, rows, kind, .. } = group;
         if matches!(kind, GroupKind::Prescribed(_)) {
             return flow;
@@ -745,12 +841,12 @@ impl<E: Eight, const B: usize> Passage<E, B> for Lower<'_, B> {
 
 /// Eliminates the right-hand sides of a group: the flow above it, from the one below.
 #[inline(always)]
-fn lift<E: Eight, const B: usize, const W: usize>(
+fn lift<E: Eight, const B: usize, const U: usize, const W: usize>(
     axes: [&Generators<Line<B>>; W],
     x: [&mut f64; W],
     inverse: &Square,
-    flow: InLine<E, B>,
-) -> InLine<E, B> {
+    flow: InLine<E, U>,
+) -> InLine<E, U> {
     let mut b = [0.0; W];
     for a in 0..W {
         b[a] = *x[a] - InLine::of(&axes[a].minus).dot(flow);
@@ -769,11 +865,11 @@ fn lift<E: Eight, const B: usize, const W: usize>(
 
 /// The solution of a group and the flow below it, from the one above.
 #[inline(always)]
-fn lower<E: Eight, const B: usize, const W: usize>(
+fn lower<E: Eight, const B: usize, const U: usize, const W: usize>(
     axes: [&Generators<Line<B>>; W],
     x: [&mut f64; W],
-    flow: InLine<E, B>,
-) -> InLine<E, B> {
+    flow: InLine<E, U>,
+) -> InLine<E, U> {
     let mut next = flow;
     for (x, axis) in x.into_iter().zip(axes) {
         *x -= InLine::of(&axis.lower).dot(flow);

@@ -23,15 +23,18 @@
 //! What acts from a body above acts on that one too, and nothing of it changes with the joints above both, which
 //! feel nothing of it. Between the bodies it is as if from the world, so sums end above the joint that hangs from
 //! the upper one. All that acts across one joint has to be from the same body for that, or from the world
-//! ([`Model::find_field_ends`]); else matrices are filled entry by entry.
+//! ([`Model::find_acting`]); else matrices are filled entry by entry.
 
 use plantd_math::eights::{Eight, InEights, in_eights};
 use plantd_math::rows::Block;
 use plantd_math::spatial::{Force, Mat3, Motion, Vec3};
 
+use crate::lagrangian::curvature::Curvature;
 use crate::lagrangian::instant::Instant;
 use crate::lagrangian::momenta::Momenta;
-use crate::model::mechanism::{Blocks, Forces, Model, Potentials, Span, Spring, mover, span};
+use crate::model::mechanism::{
+    Acting, Blocks, Forces, Model, Potentials, Span, Spring, mover, span,
+};
 use crate::model::tree::{Tree, WORLD};
 
 /// Takes a wrench, and its change with the motion of the body `(J, J̇)`.
@@ -86,6 +89,7 @@ pub(crate) struct Fields {
     /// The place of each joint in `sums`, or [`NOWHERE`].
     places: Vec<usize>,
     pub(crate) given: Vec<Given>,
+    passed: Vec<Passed>,
     /// Whether some follow velocities: else `D` is zero, and nobody looks at `drag` and `back`.
     pub(crate) has_rates: bool,
 }
@@ -163,8 +167,8 @@ impl Model {
         }
     }
 
-    /// [`Model::field_ends`].
-    pub(crate) fn find_field_ends(&self) -> Option<Vec<bool>> {
+    /// [`Model::acting`].
+    pub(crate) fn find_acting(&self) -> Option<Vec<Acting>> {
         let joints = &self.dynamics.joints[..];
         let mut bases = vec![None; joints.len()];
         for (Span { body, base }, ..) in self.fields(1.0) {
@@ -177,9 +181,17 @@ impl Model {
                 at = joints[at].parent;
             }
         }
-        let ends = joints.iter().zip(bases);
-        let ends = ends.map(|(joint, base)| joint.parent != WORLD && base == Some(joint.parent));
-        Some(ends.collect())
+        let acting = joints.iter().zip(bases).map(|(joint, base)| match base {
+            None => Acting::Nothing,
+            Some(base) if base != WORLD && base == joint.parent => Acting::Ends,
+            Some(_) => Acting::Through,
+        });
+        Some(acting.collect())
+    }
+
+    /// Across how many joints something acts.
+    pub(crate) fn acted_on(&self) -> usize {
+        self.acting.iter().flatten().filter(|acting| **acting != Acting::Nothing).count()
     }
 }
 
@@ -227,7 +239,8 @@ impl Fields {
         }
         let given = vec![Given::default(); joints.len()];
         let has_rates = model.fields(1.0).any(|(_, field, _)| field.has_rates());
-        Self { sums: vec![Sum::default(); count], places, given, has_rates }
+        let (sums, passed) = (vec![Sum::default(); count], vec![Passed::default(); joints.len()]);
+        Self { sums, places, given, passed, has_rates }
     }
 
     /// Finds what joints give; forces count `weight` times.
@@ -249,8 +262,22 @@ impl Fields {
                 }
             });
         }
-        let ends = model.field_ends.as_deref().unwrap_or_default();
-        in_eights(Gather { fields: self, ends, at });
+        let acting = model.acting.as_deref().unwrap_or_default();
+        in_eights(Gather { fields: self, acting, at });
+    }
+
+    /// Adds, `weight` times, how the generalized forces change with changes of the dynamic coordinates and their
+    /// velocities, at the last evaluation; but for what ball joints have of themselves.
+    pub(crate) fn add_change(
+        &mut self,
+        model: &Model,
+        curvature: &Curvature,
+        changes: [&[f64]; 2],
+        weight: f64,
+        force: &mut [f64],
+    ) {
+        let (tree, acting) = (&model.dynamics, model.acting.as_deref().unwrap_or_default());
+        in_eights(Change { fields: self, tree, acting, curvature, changes, weight, force });
     }
 
     /// What the axes of a ball joint that begin with `first` have among themselves.
@@ -269,7 +296,7 @@ impl Fields {
 /// What [`Fields::evaluate`] does once each body has what acts on it.
 struct Gather<'a> {
     fields: &'a mut Fields,
-    ends: &'a [bool],
+    acting: &'a [Acting],
     at: &'a Instant<'a>,
 }
 
@@ -278,9 +305,10 @@ impl InEights for Gather<'_> {
 
     #[inline(always)]
     fn run<E: Eight>(self) {
-        let Self { fields: Fields { sums, places, given, has_rates }, ends, at } = self;
+        let Self { fields: Fields { sums, places, given, has_rates, .. }, acting, at } = self;
         let mut sum = Sum::default();
-        for (i, joint) in at.tree.joints.iter().enumerate().rev() {
+        let joints = at.tree.joints.iter().zip(acting).enumerate().rev();
+        for (i, (joint, acting)) in joints.filter(|(_, (_, acting))| **acting != Acting::Nothing) {
             if let Some(own) = sums.get(places[i]) {
                 sum.add::<E>(own);
             }
@@ -297,12 +325,89 @@ impl InEights for Gather<'_> {
                 combined::<E>(&by_rate[1], axis).put(&mut given.back);
             }
             pull.put(&mut given.pull);
-            let is_end = ends[i];
+            let is_end = *acting == Acting::Ends;
             if !is_end && !joint.follows(i) && joint.parent != WORLD {
                 sums[places[joint.parent]].add::<E>(&sum);
             }
             if is_end || !joint.follows(i) {
                 sum = Sum::default();
+            }
+        }
+    }
+}
+
+/// What joints pass on to each other where their motion changes.
+#[derive(Clone, Copy, Debug, Default)]
+struct Passed {
+    /// `Σ J a` and `Σ J̇ a + J b`, on the way down.
+    down: [Block; 2],
+    /// `Σ pull a + drag b` of what is below.
+    up: Block,
+}
+
+/// What [`Fields::add_change`] does: from the roots to the leaves and back.
+struct Change<'a> {
+    fields: &'a mut Fields,
+    tree: &'a Tree,
+    acting: &'a [Acting],
+    curvature: &'a Curvature,
+    changes: [&'a [f64]; 2],
+    weight: f64,
+    force: &'a mut [f64],
+}
+
+impl InEights for Change<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<E: Eight>(self) {
+        let Self { fields, tree, acting, curvature, changes: [position, velocity], .. } = self;
+        let Fields { given, passed, .. } = fields;
+        let changes = |i: usize| match (position.get(i), velocity.get(i)) {
+            (Some(a), Some(b)) => [*a, *b],
+            _ => [0.0; 2],
+        };
+        let rest = [Block::ZERO; 2];
+        let joints = tree.joints.iter().zip(acting).enumerate();
+        let acted_on = joints.filter(|(_, (_, acting))| **acting != Acting::Nothing);
+        let is_first =
+            |joint: usize, parent: usize| parent == WORLD || acting[joint] == Acting::Ends;
+        for (i, (joint, _)) in acted_on.clone() {
+            let [moved, faster] = match joint.parent {
+                parent if is_first(i, parent) => &rest,
+                parent => &passed[parent].down,
+            };
+            let [a, b] = changes(joint.coordinate);
+            let (axis, rate) = (E::of(&curvature.axis[i]), E::of(&curvature.rate[i]));
+            let moved = E::of(moved).plus(axis.scaled(a));
+            let faster = E::of(faster).plus(rate.scaled(a)).plus(axis.scaled(b));
+            let own = &mut passed[i];
+            moved.put(&mut own.down[0]);
+            faster.put(&mut own.down[1]);
+            own.up = Block::ZERO;
+        }
+        for (i, (joint, _)) in acted_on.rev() {
+            let Given { pull, turn, drag, back } = &given[i];
+            let [a, b] = changes(joint.coordinate);
+            let own = E::of(pull).scaled(a).plus(E::of(drag).scaled(b));
+            let all = E::of(&passed[i].up).plus(own);
+            // Of a ball joint, what is above all of its axes, and below all.
+            let [first, last] = [joint.first_axis(i), joint.last_axis(i)];
+            let [moved, faster] = match tree.joints[first].parent {
+                parent if is_first(first, parent) => &rest,
+                parent => &passed[parent].down,
+            };
+            let mut below = passed[last].up;
+            if first == last {
+                all.put(&mut below);
+            }
+            if let Some(force) = self.force.get_mut(joint.coordinate) {
+                let from_above = E::dot_of(turn, moved) + E::dot_of(back, faster);
+                *force += self.weight * (from_above + E::dot_of(&curvature.axis[i], &below));
+            }
+            if !is_first(i, joint.parent) {
+                let up = &mut passed[joint.parent].up;
+                E::of(up).plus(all).put(up);
             }
         }
     }

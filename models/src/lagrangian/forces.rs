@@ -62,6 +62,10 @@ pub(crate) trait GeneralizedForce {
         entry: &mut impl FnMut(usize, usize, S, S),
     );
 
+    /// A bound of the second derivative of `f_i` along changes of coordinates and of their velocities whose magnitudes
+    /// sum up to `extent`, near an instant.
+    fn second_derivative(&self, at: &Instant<'_>, extent: [f64; 2]) -> f64;
+
     /// Calls `entry(i, k, ∂f_i/∂u_k)` for coordinates and inputs, in the same order for every
     /// configuration; the derivatives add up. Most forces follow no input.
     fn for_each_input_derivative<S: Scalar>(
@@ -145,6 +149,13 @@ impl Forces {
         let points = self.point_forces.iter().map(|force| force.ends.mover);
         let paths = self.path_forces.iter().map(|force| mover(&force.segments));
         points.chain(paths).any(|mover| matches!(mover, Some(Mover::Ball(_))))
+    }
+
+    /// The sum of [`GeneralizedForce::second_derivative`] over all forces.
+    pub(crate) fn second_derivative(&self, at: &Instant<'_>, extent: [f64; 2]) -> f64 {
+        let mut sum = 0.0;
+        for_each_force!(self, force => sum += force.second_derivative(at, extent));
+        sum
     }
 
     /// [`GeneralizedForce::for_each_derivative`] of each force.

@@ -39,6 +39,9 @@ pub(crate) trait Potential {
         entry: &mut impl FnMut(usize, usize, S),
     );
 
+    /// A bound of `|Σ V_ijk x_j x_k|` near a configuration, where `Σ |x|` is 1.
+    fn third_derivative(&self, at: Place<'_, f64>) -> f64;
+
     /// Whether it may couple coordinates that are not on one path to the root, or prescribed ones.
     fn couples_branches(&self) -> bool {
         Self::NEEDS_POSES || self.couples().len() > 1
@@ -96,6 +99,12 @@ impl Model {
         let at = Place { tree: &self.dynamics, poses, q };
         let energy = |spring: &Spring| of_each_kind!(spring, spring => spring.energy(at));
         self.potentials.springs.iter().fold(S::ZERO, |sum, spring| sum + energy(spring))
+    }
+
+    /// The sum of [`Potential::third_derivative`] over all springs.
+    pub(crate) fn third_spring_derivative(&self, at: Place<'_, f64>) -> f64 {
+        let bound = |spring: &Spring| of_each_kind!(spring, spring => spring.third_derivative(at));
+        self.potentials.springs.iter().map(bound).sum()
     }
 
     /// Calls `entry(i, V_ii)` for the springs of single coordinates, and those across one joint that is no ball joint.
@@ -199,6 +208,36 @@ mod tests {
                 samples::assert_close(name, &[energy(model, &dual).eps], &found);
             }
         }
+    }
+
+    /// Third derivatives along directions, by dual numbers, are within their bounds, and these are no more than some
+    /// hundred times as large.
+    #[test]
+    fn third_derivatives_are_bounded() {
+        let (mut count, mut ratios) = (0, 0.0);
+        for model in models().iter().filter(|model| model.potentials.any) {
+            let n = model.dimensions.coordinates();
+            for sample in 0..5 {
+                let (q, direction) = samples::configuration(model, sample);
+                let extent: f64 = direction.iter().map(|x| x.abs()).sum();
+                let along: Vec<f64> = direction.iter().map(|x| x / extent).collect();
+                let slopes = hessian(model, &samples::along(model, &q, &along));
+                let turns = slopes.chunks(n).map(|row| {
+                    row.iter().zip(&along).map(|(slope, x)| slope.eps * x).sum::<f64>().abs()
+                });
+                let most = turns.fold(0.0, f64::max);
+                let poses = q.poses(&model.dynamics);
+                let at = Place { tree: &model.dynamics, poses: &poses, q: &q.q };
+                let bound = model.third_spring_derivative(at);
+                assert!(most <= bound * (1.0 + 1e-9), "{}: {most} {bound}", model.scene.name);
+                if most > 1e-6 && bound.is_finite() {
+                    (count, ratios) = (count + 1, ratios + (bound / most).ln());
+                }
+            }
+        }
+        let mean = (ratios / f64::from(count)).exp();
+        println!("{count} samples, bounds on average {mean:.0} times what is there");
+        assert!(count > 100 && mean < 1000.0, "{count} {mean}");
     }
 
     /// A two-point spring without rest length is smooth where its ends meet; with one, and along a path,

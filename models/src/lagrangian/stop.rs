@@ -59,6 +59,16 @@ impl Stop {
         (w * self.damping, slope * self.damping)
     }
 
+    /// Bounds of `w` and of its first two derivatives, near `s`.
+    pub(crate) fn steepness(&self, s: f64) -> [f64; 3] {
+        let ([low, high], inverse) = (self.range, 1.0 / self.transition);
+        if s > low + self.transition && s < high - self.transition {
+            return [0.0; 3];
+        }
+        // 30 t² (1 − t)² is largest at ½, and its derivative at (1 − 1/√3)/2.
+        [1.0, 1.875 * inverse, 10.0 / 3.0_f64.sqrt() * inverse * inverse]
+    }
+
     /// `w`, and its derivative by `s`.
     fn share<S: Scalar>(&self, s: S) -> (S, S) {
         let (t, sign) = self.depth(s);

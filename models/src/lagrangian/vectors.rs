@@ -163,6 +163,31 @@ impl<'a, S: Scalar> Distance<'a, S> {
     }
 }
 
+impl Distance<'_, f64> {
+    /// Bounds of `|l_i|`, `|l_ij|` and `|l_ijk|`: with `r` the longest lever of a joint, `r`, `r (r/l + 1)` and
+    /// `r (3 r²/l² + 3 r/l + 1)`. Not finite where the points coincide.
+    pub(crate) fn steepness(&self) -> [f64; 3] {
+        let lever = self.pair.lever(self.tree, self.poses, &self.at);
+        let ratio = lever / self.length;
+        [lever, lever * (ratio + 1.0), lever * (3.0 * ratio * (ratio + 1.0) + 1.0)]
+    }
+}
+
+impl PointPair {
+    /// The farthest that one joint moves the points against each other, by a unit of its coordinate.
+    pub(crate) fn lever(&self, tree: &Tree, poses: &Poses, at: &Separation) -> f64 {
+        let levers = self.path.iter().map(|joint| joint.gradient(tree, poses, at).norm());
+        levers.fold(0.0, f64::max)
+    }
+}
+
+/// Sums of what the segments of a path have.
+pub(crate) fn steepness_of<'a>(segments: impl Iterator<Item = Distance<'a, f64>>) -> [f64; 3] {
+    segments
+        .map(|segment| segment.steepness())
+        .fold([0.0; 3], |[a, b, c], [own_a, own_b, own_c]| [a + own_a, b + own_b, c + own_c])
+}
+
 /// The end of a segment that all joints between its points carry.
 pub(crate) struct MovingEnd<'a> {
     pub(crate) of: &'a Attachment,

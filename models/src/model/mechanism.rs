@@ -57,9 +57,11 @@ pub struct Model {
     pub(crate) pairs: Vec<Pair>,
     /// Ancestor and descendant pairs of which exactly one is prescribed.
     pub(crate) mixed_pairs: Vec<MixedPair>,
-    /// Of each joint, whether what acts on bodies that it carries ends above it, at what it hangs from
-    /// ([`fields`](crate::lagrangian::fields)). `None` where elements act across one joint from different bodies.
-    pub(crate) field_ends: Option<Vec<bool>>,
+    /// What acts on bodies across each joint. `None` where elements act across one joint from different bodies.
+    pub(crate) acting: Option<Vec<Acting>>,
+    /// Whether the end of steps is foreseen with the springs and forces that it has beside
+    /// [simple ones](Model::has_simple_elements).
+    pub(crate) foresees_elements: bool,
     /// What pivots are compared with.
     pub(crate) conditioning: Conditioning,
     pub(crate) initial_violations: Vec<Violation>,
@@ -86,6 +88,16 @@ pub(crate) enum Solver {
     Spatial,
     /// By generators in planes, together with the constraints, front by front.
     Loops,
+}
+
+/// What of the [elements between bodies](crate::lagrangian::fields) acts across a joint.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Acting {
+    Nothing,
+    /// Something, from the world or from a body farther up than what the joint hangs from.
+    Through,
+    /// Something, from the body that the joint hangs from.
+    Ends,
 }
 
 /// How many blocks the vectors of joints in space have.
@@ -128,21 +140,27 @@ impl Solver {
     /// 1.47, 1.21, 0.67 and 0.27.
     const DEEP_WITH_RATES: usize = 18;
 
-    /// Whether generators of so many blocks are faster in space.
-    pub(crate) fn is_deep(elimination: &SymbolicElimination, blocks: Blocks) -> bool {
+    /// Whether generators are faster in space, where something acts across so many joints and vectors have so many blocks
+    /// there.
+    pub(crate) fn is_deep(
+        elimination: &SymbolicElimination,
+        (acted_on, blocks): (usize, Blocks),
+    ) -> bool {
         let least = match blocks {
             Blocks::One => Self::DEEP,
             Blocks::Two => Self::DEEP_WITH_FIELDS,
             Blocks::Three => Self::DEEP_WITH_RATES,
         };
-        elimination.entries() > least * elimination.rows()
+        let more = acted_on * (least - Self::DEEP);
+        elimination.entries() > Self::DEEP * elimination.rows() + more
     }
 
     /// The fastest one for a model without loops and limbs that are held.
     pub(crate) fn of(model: &Model) -> Self {
         let d = model.dimensions;
         if model.is_generated_in_space() {
-            let is_deep = Self::is_deep(&model.elimination, model.blocks());
+            let acted_on = (model.acted_on(), model.blocks());
+            let is_deep = Self::is_deep(&model.elimination, acted_on);
             return if is_deep { Self::Spatial } else { Self::Tree };
         }
         let is_free = d.constraints == 0 && d.prescribed == 0 && model.joints_are_in_order();
@@ -753,7 +771,7 @@ impl Model {
         d.constraints == 0
             && self.forces.as_ref().is_none_or(are_generated)
             && self.potentials.springs.iter().all(Spring::is_generated)
-            && self.field_ends.is_some()
+            && self.acting.is_some()
             && self.armature.iter().all(|armature| armature.row == armature.column)
             && self.joints_are_in_order()
     }

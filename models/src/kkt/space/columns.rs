@@ -65,7 +65,7 @@ type Flow<E, const B: usize> = [[E; 8]; B];
 
 /// The product of a vector with each column.
 #[inline(always)]
-fn product<E: Eight, const B: usize>(line: &Line<B>, flow: &Flow<E, B>) -> E {
+fn product<E: Eight, const B: usize, const U: usize>(line: &Line<B>, flow: &Flow<E, U>) -> E {
     let mut sum = E::ZERO;
     for (at, (block, flow)) in line.0.iter().zip(flow).enumerate() {
         let Block([a, b, c, d, e, f, g, h]) = block;
@@ -79,7 +79,7 @@ fn product<E: Eight, const B: usize>(line: &Line<B>, flow: &Flow<E, B>) -> E {
 
 /// Adds a vector, times a number for each column.
 #[inline(always)]
-fn add<E: Eight, const B: usize>(flow: &mut Flow<E, B>, line: &Line<B>, times: E) {
+fn add<E: Eight, const B: usize, const U: usize>(flow: &mut Flow<E, U>, line: &Line<B>, times: E) {
     for (flow, block) in flow.iter_mut().zip(&line.0) {
         for (own, entry) in flow.iter_mut().zip(&block.0) {
             *own = own.plus(times.scaled(*entry));
@@ -89,8 +89,8 @@ fn add<E: Eight, const B: usize>(flow: &mut Flow<E, B>, line: &Line<B>, times: E
 
 /// Adds what a joint that is moved gives to its two columns.
 #[inline(always)]
-fn add_moved<E: Eight, const B: usize>(
-    flow: &mut Flow<E, B>,
+fn add_moved<E: Eight, const B: usize, const U: usize>(
+    flow: &mut Flow<E, U>,
     vectors: [&Line<B>; 2],
     columns: [usize; 2],
     first: usize,
@@ -111,8 +111,8 @@ fn end<E: Eight, const B: usize>(flow: &mut Flow<E, B>) {
 }
 
 #[inline(always)]
-fn of_blocks<E: Eight, const B: usize>(blocks: &Flow<Block, B>) -> Flow<E, B> {
-    let mut all = [[E::ZERO; 8]; B];
+fn of_blocks<E: Eight, const B: usize, const U: usize>(blocks: &Flow<Block, B>) -> Flow<E, U> {
+    let mut all = [[E::ZERO; 8]; U];
     for (all, blocks) in all.iter_mut().zip(blocks) {
         for (own, block) in all.iter_mut().zip(blocks) {
             *own = E::of(block);
@@ -141,64 +141,81 @@ impl<const B: usize> Columns<B> {
         margins: &Margins<B>,
         first: usize,
     ) {
-        let SpatialRecursion { limbs, groups, axes, within, .. } = recursion;
+        for limb in &recursion.limbs {
+            if B > 1 && limb.is_acted_on {
+                self.climb::<E, B>(limb, recursion, margins, first);
+            } else {
+                self.climb::<E, 1>(limb, recursion, margins, first);
+            }
+        }
+    }
+
+    /// Up a limb whose vectors have `U` blocks of use.
+    #[inline(always)]
+    fn climb<E: Eight, const U: usize>(
+        &mut self,
+        limb: &Limb,
+        recursion: &SpatialRecursion<B>,
+        margins: &Margins<B>,
+        first: usize,
+    ) {
+        let SpatialRecursion { groups, axes, within, .. } = recursion;
         let n = axes.len();
         let has = |reach: &Range<usize>, more: usize| {
             reach.start < reach.end
                 && reach.start + more < first + LANES
                 && first < reach.end + more
         };
-        for Limb { groups: own, carries, hangs_from } in limbs {
-            let mut flow = [[E::ZERO; 8]; B];
-            if let Some(place) = *carries {
-                flow = of_blocks(&self.flows[place]);
-                self.flows[place] = [[Block::ZERO; 8]; B];
-            }
-            let mut any = false;
-            for at in own.clone() {
-                let Group { axes: range, rows, kind, reach, is_end } = &groups[at];
-                any = any || reach.iter().any(|reach| has(reach, 0) || has(reach, n));
-                let (start, own_margins) = (rows.start, &margins.axes[range.clone()]);
-                let increment = &mut self.increment[range.clone()];
-                let momentum = &mut self.momentum[range.clone()];
-                match kind {
-                    GroupKind::Prescribed(_) => {
-                        for (own, column) in own_margins.iter().zip(start..) {
-                            let vectors = [&own.below, &own.push];
-                            add_moved(&mut flow, vectors, [column, n + column], first);
-                        }
-                    }
-                    _ if !any => {
-                        increment.fill(Block::ZERO);
-                        momentum.fill(Block::ZERO);
-                    }
-                    _ => {
-                        let group = Lifted {
-                            margins: own_margins,
-                            among: &margins.among[at],
-                            inverse: &within[at],
-                            increment,
-                            momentum,
-                            columns: [start, n + start],
-                            first,
-                        };
-                        match &axes[range.clone()] {
-                            [a] => group.lift([a], &mut flow),
-                            [a, b] => group.lift([a, b], &mut flow),
-                            [a, b, c] => group.lift([a, b, c], &mut flow),
-                            _ => {}
-                        }
+        let Limb { groups: own, carries, hangs_from, .. } = limb;
+        let mut flow = [[E::ZERO; 8]; U];
+        if let Some(place) = *carries {
+            flow = of_blocks(&self.flows[place]);
+            self.flows[place] = [[Block::ZERO; 8]; B];
+        }
+        let mut any = false;
+        for at in own.clone() {
+            let Group { axes: range, rows, kind, reach, is_end } = &groups[at];
+            any = any || reach.iter().any(|reach| has(reach, 0) || has(reach, n));
+            let (start, own_margins) = (rows.start, &margins.axes[range.clone()]);
+            let increment = &mut self.increment[range.clone()];
+            let momentum = &mut self.momentum[range.clone()];
+            match kind {
+                GroupKind::Prescribed(_) => {
+                    for (own, column) in own_margins.iter().zip(start..) {
+                        let vectors = [&own.below, &own.push];
+                        add_moved(&mut flow, vectors, [column, n + column], first);
                     }
                 }
-                if B > 1 && *is_end {
-                    end(&mut flow);
+                _ if !any => {
+                    increment.fill(Block::ZERO);
+                    momentum.fill(Block::ZERO);
+                }
+                _ => {
+                    let group = Lifted {
+                        margins: own_margins,
+                        among: &margins.among[at],
+                        inverse: &within[at],
+                        increment,
+                        momentum,
+                        columns: [start, n + start],
+                        first,
+                    };
+                    match &axes[range.clone()] {
+                        [a] => group.lift([a], &mut flow),
+                        [a, b] => group.lift([a, b], &mut flow),
+                        [a, b, c] => group.lift([a, b, c], &mut flow),
+                        _ => {}
+                    }
                 }
             }
-            if let (true, Some(Fork { place, .. })) = (any, hangs_from) {
-                let all = self.flows[*place].as_flattened_mut().iter_mut();
-                for (all, own) in all.zip(flow.as_flattened()) {
-                    E::of(all).plus(*own).put(all);
-                }
+            if U > 1 && *is_end {
+                end(&mut flow);
+            }
+        }
+        if let (true, Some(Fork { place, .. })) = (any, hangs_from) {
+            let all = self.flows[*place].as_flattened_mut().iter_mut();
+            for (all, own) in all.zip(flow.as_flattened()) {
+                E::of(all).plus(*own).put(all);
             }
         }
     }
@@ -212,46 +229,64 @@ impl<const B: usize> Columns<B> {
         first: usize,
         rows: &mut Rows<'_>,
     ) {
-        let SpatialRecursion { limbs, groups, axes, .. } = recursion;
-        let n = axes.len();
-        for Limb { groups: own, carries, hangs_from, .. } in limbs.iter().rev() {
-            let mut motion = match hangs_from {
-                Some(fork) => of_blocks(&self.motions[fork.place]),
-                None => [[E::ZERO; 8]; B],
-            };
-            for at in own.clone().rev() {
-                let Group { axes: range, rows: own, kind, is_end, .. } = &groups[at];
-                if B > 1 && *is_end {
-                    end(&mut motion);
-                }
-                let (start, own_margins) = (own.start, &margins.axes[range.clone()]);
-                if let GroupKind::Prescribed(_) = kind {
-                    for (own, column) in own_margins.iter().zip(start..) {
-                        let vectors = [&own.above, &own.carry];
-                        add_moved(&mut motion, vectors, [column, n + column], first);
-                    }
-                    continue;
-                }
-                let group = Lowered {
-                    margins: own_margins,
-                    among: &margins.among[at],
-                    increment: &self.increment[range.clone()],
-                    momentum: &self.momentum[range.clone()],
-                    start,
-                    first,
-                };
-                match &axes[range.clone()] {
-                    [a] => group.lower([a], &mut motion, rows),
-                    [a, b] => group.lower([a, b], &mut motion, rows),
-                    [a, b, c] => group.lower([a, b, c], &mut motion, rows),
-                    _ => {}
-                }
+        for limb in recursion.limbs.iter().rev() {
+            if B > 1 && limb.is_acted_on {
+                self.climb_down::<E, B>(limb, recursion, margins, first, rows);
+            } else {
+                self.climb_down::<E, 1>(limb, recursion, margins, first, rows);
             }
-            if let Some(place) = carries {
-                let all = self.motions[*place].as_flattened_mut().iter_mut();
-                for (to, own) in all.zip(motion.as_flattened()) {
-                    own.put(to);
+        }
+    }
+
+    /// Down a limb.
+    #[inline(always)]
+    fn climb_down<E: Eight, const U: usize>(
+        &mut self,
+        limb: &Limb,
+        recursion: &SpatialRecursion<B>,
+        margins: &Margins<B>,
+        first: usize,
+        rows: &mut Rows<'_>,
+    ) {
+        let SpatialRecursion { groups, axes, .. } = recursion;
+        let n = axes.len();
+        let Limb { groups: own, carries, hangs_from, .. } = limb;
+        let mut motion = match hangs_from {
+            Some(fork) => of_blocks::<E, B, U>(&self.motions[fork.place]),
+            None => [[E::ZERO; 8]; U],
+        };
+        for at in own.clone().rev() {
+            let Group { axes: range, rows: own, kind, is_end, .. } = &groups[at];
+            if U > 1 && *is_end {
+                end(&mut motion);
+            }
+            let (start, own_margins) = (own.start, &margins.axes[range.clone()]);
+            if let GroupKind::Prescribed(_) = kind {
+                for (own, column) in own_margins.iter().zip(start..) {
+                    let vectors = [&own.above, &own.carry];
+                    add_moved(&mut motion, vectors, [column, n + column], first);
                 }
+                continue;
+            }
+            let group = Lowered {
+                margins: own_margins,
+                among: &margins.among[at],
+                increment: &self.increment[range.clone()],
+                momentum: &self.momentum[range.clone()],
+                start,
+                first,
+            };
+            match &axes[range.clone()] {
+                [a] => group.lower([a], &mut motion, rows),
+                [a, b] => group.lower([a, b], &mut motion, rows),
+                [a, b, c] => group.lower([a, b, c], &mut motion, rows),
+                _ => {}
+            }
+        }
+        if let Some(place) = carries {
+            let all = self.motions[*place].as_flattened_mut().iter_mut();
+            for (to, own) in all.zip(motion.as_flattened()) {
+                own.put(to);
             }
         }
     }
@@ -271,10 +306,10 @@ struct Lifted<'a, const B: usize> {
 
 impl<const B: usize> Lifted<'_, B> {
     #[inline(always)]
-    fn lift<E: Eight, const W: usize>(
+    fn lift<E: Eight, const U: usize, const W: usize>(
         self,
         axes: [&Generators<Line<B>>; W],
-        flow: &mut Flow<E, B>,
+        flow: &mut Flow<E, U>,
     ) {
         let Self { margins, among, inverse, increment, momentum, columns, first } = self;
         let [mut residual, mut carried] = [[E::ZERO; W]; 2];
@@ -321,10 +356,10 @@ struct Lowered<'a, const B: usize> {
 
 impl<const B: usize> Lowered<'_, B> {
     #[inline(always)]
-    fn lower<E: Eight, const W: usize>(
+    fn lower<E: Eight, const U: usize, const W: usize>(
         self,
         axes: [&Generators<Line<B>>; W],
-        motion: &mut Flow<E, B>,
+        motion: &mut Flow<E, U>,
         rows: &mut Rows<'_>,
     ) {
         let Self { margins, among, increment, momentum, start, first } = self;

@@ -7,7 +7,7 @@ use crate::kkt::space::columns::{AllColumns, Columns, Rows};
 use crate::kkt::space::margins::{Keep, Margins, Own};
 use crate::kkt::space::products::{PullBack, PushForward};
 use crate::kkt::space::vectors::Vectors;
-use crate::kkt::space::{Added, Factor, SpatialRecursion};
+use crate::kkt::space::{Added, Factor, Limb, SpatialRecursion};
 use crate::lagrangian::curvature::Curvature;
 use crate::lagrangian::generators::{MatrixKind, Step};
 use crate::model::mechanism::{Blocks, Model};
@@ -70,13 +70,15 @@ impl<const B: usize> Eliminated<B> {
     /// time                                        1.8             1.4            1.25            0.55
     /// ```
     fn is_faster_by_columns(&self, entries: usize) -> bool {
-        let SpatialRecursion { axes, limbs, .. } = &self.recursion;
-        let least = match B {
-            1 => 31,
-            2 => 48,
-            _ => 180,
+        let SpatialRecursion { limbs, groups, .. } = &self.recursion;
+        let least = |limb: &Limb| match B {
+            2 if limb.is_acted_on => 48,
+            3 if limb.is_acted_on => 180,
+            _ => 31,
         };
-        10 * entries > least * (axes.len() + limbs.len())
+        let axes = |limb: &Limb| groups[limb.groups.clone()].iter().map(|group| group.axes.len());
+        let all = limbs.iter().map(|limb| least(limb) * (1 + axes(limb).sum::<usize>()));
+        10 * entries > all.sum()
     }
 }
 

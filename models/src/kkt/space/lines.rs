@@ -40,14 +40,24 @@ impl<E: Eight, const B: usize> InLine<E, B> {
         Self(blocks)
     }
 
+    /// To a line, whose other blocks become zero.
+    #[inline(always)]
+    pub(crate) fn put_alone<const L: usize>(self, line: &mut Line<L>) {
+        if L > B {
+            *line = Line::ZERO;
+        }
+        self.put(line);
+    }
+
     /// Its first block alone.
     #[inline(always)]
     pub(crate) fn ended(self) -> Self {
         Self::new(self.0[0], E::ZERO, E::ZERO)
     }
 
+    /// The first blocks of a line that has more.
     #[inline(always)]
-    pub(crate) fn of(line: &Line<B>) -> Self {
+    pub(crate) fn of<const L: usize>(line: &Line<L>) -> Self {
         let mut blocks = [E::ZERO; B];
         for (own, block) in blocks.iter_mut().zip(&line.0) {
             *own = E::of(block);
@@ -55,8 +65,9 @@ impl<E: Eight, const B: usize> InLine<E, B> {
         Self(blocks)
     }
 
+    /// To the first blocks of a line that has more.
     #[inline(always)]
-    pub(crate) fn put(self, line: &mut Line<B>) {
+    pub(crate) fn put<const L: usize>(self, line: &mut Line<L>) {
         for (own, block) in self.0.into_iter().zip(&mut line.0) {
             own.put(block);
         }
@@ -102,7 +113,10 @@ impl<E: Eight, const B: usize> InLine<E, B> {
 
 /// The sum of lines, each times an entry of `v`.
 #[inline(always)]
-pub(crate) fn combined<E: Eight, const B: usize>(lines: &Lines<E, B>, v: &Line<B>) -> InLine<E, B> {
+pub(crate) fn combined<E: Eight, const B: usize, const L: usize>(
+    lines: &Lines<E, B>,
+    v: &Line<L>,
+) -> InLine<E, B> {
     let mut sum = InLine::ZERO;
     for (b, (lines, Block(v))) in lines.iter().zip(&v.0).enumerate() {
         let mut sums = [InLine::ZERO; 4];

@@ -69,12 +69,12 @@ pub(super) struct Keep<'a, const B: usize> {
 
 impl<E: Eight, const B: usize> Watch<E, B> for Keep<'_, B> {
     #[inline(always)]
-    fn see(
+    fn see<const U: usize>(
         &mut self,
         at: usize,
         group: &Group,
         axes: &[Generators<Line<B>>],
-        sums: Option<&Sums<E, B>>,
+        sums: Option<&Sums<E, U>>,
     ) {
         let Self { kept, vectors, own } = self;
         let first = group.axes.start;
@@ -84,7 +84,7 @@ impl<E: Eight, const B: usize> Watch<E, B> for Keep<'_, B> {
             GroupKind::Single => {}
             GroupKind::Ball(ball) => {
                 let (turning, weights) = (&own.turnings[ball], &vectors.added.balls[ball]);
-                let all = vectors.margins_of_ball::<E, B>(first, turning, weights);
+                let all = vectors.margins_of_ball::<E, U>(first, turning, weights);
                 for (own, margin) in all.into_iter().zip(&mut *margins) {
                     own.put(margin);
                 }
@@ -97,12 +97,12 @@ impl<E: Eight, const B: usize> Watch<E, B> for Keep<'_, B> {
             GroupKind::Prescribed(ball) => {
                 match (ball, &mut *margins) {
                     (Some(ball), [a, b, c]) => {
-                        let [k, l, m] = vectors.moved_ball::<E, B>(first, &own.turnings[ball]);
+                        let [k, l, m] = vectors.moved_ball::<E, U>(first, &own.turnings[ball]);
                         k.put(a);
                         l.put(b);
                         m.put(c);
                     }
-                    (_, [own, ..]) => vectors.moved::<E, B>(first).put(own),
+                    (_, [own, ..]) => vectors.moved::<E, U>(first).put(own),
                     _ => {}
                 }
                 let Some(sums) = sums else { return };
@@ -115,7 +115,7 @@ impl<E: Eight, const B: usize> Watch<E, B> for Keep<'_, B> {
             }
         }
         for (i, margin) in group.axes.clone().zip(&mut *margins) {
-            vectors.margin::<E, B>(i).put(margin);
+            vectors.margin::<E, U>(i).put(margin);
         }
         let Diagonals { residual, by_start, by_increment } = own.diagonals;
         let diagonals =
@@ -143,16 +143,16 @@ impl Among {
 
 /// What hinges, slides and screws one below the other have among themselves.
 #[inline(always)]
-fn write_among<E: Eight, const B: usize, const W: usize>(
+fn write_among<E: Eight, const B: usize, const U: usize, const W: usize>(
     axes: [&Generators<Line<B>>; W],
     margins: &mut [Margin<Line<B>>],
     [residual, by_start, by_increment]: [&[f64]; 3],
     among: &mut Among,
-    sums: Option<&Sums<E, B>>,
+    sums: Option<&Sums<E, U>>,
 ) {
     for a in 0..W {
-        let [minus, plus] = [InLine::<E, B>::of(&axes[a].minus), InLine::of(&axes[a].plus)];
-        let [carry, above] = [InLine::<E, B>::of(&margins[a].carry), InLine::of(&margins[a].above)];
+        let [minus, plus] = [InLine::<E, U>::of(&axes[a].minus), InLine::of(&axes[a].plus)];
+        let [carry, above] = [InLine::<E, U>::of(&margins[a].carry), InLine::of(&margins[a].above)];
         for b in a..W {
             let below = InLine::of(&margins[b].below);
             among.residual[a][b] = minus.dot(below);
@@ -176,17 +176,17 @@ fn write_among<E: Eight, const B: usize, const W: usize>(
 
 /// Adds what is below.
 #[inline(always)]
-fn include<E: Eight, const B: usize, const W: usize>(
+fn include<E: Eight, const B: usize, const U: usize, const W: usize>(
     axes: [&Generators<Line<B>>; W],
     margins: &mut [Margin<Line<B>>],
     among: &mut Among,
-    sums: &Sums<E, B>,
+    sums: &Sums<E, U>,
 ) {
     for b in 0..W {
         let above = combined(&sums.columns, &margins[b].above);
         let plus = combined(&sums.columns, &axes[b].plus);
         for a in 0..W {
-            let carry = InLine::<E, B>::of(&margins[a].carry);
+            let carry = InLine::<E, U>::of(&margins[a].carry);
             among.residual[a][b] += InLine::of(&axes[a].minus).dot(above);
             among.by_start[a][b] += carry.dot(above);
             among.by_increment[a][b] += carry.dot(plus);

@@ -22,13 +22,13 @@ use crate::lagrangian::generators::Generators;
 
 /// The product of a line in memory with a flow.
 #[inline(always)]
-fn along<E: Eight, const B: usize>(line: &Line<B>, flow: InLine<E, B>) -> f64 {
+fn along<E: Eight, const B: usize, const U: usize>(line: &Line<B>, flow: InLine<E, U>) -> f64 {
     InLine::of(line).dot(flow)
 }
 
 /// A line in memory, times a number.
 #[inline(always)]
-fn times<E: Eight, const B: usize>(line: &Line<B>, factor: f64) -> InLine<E, B> {
+fn times<E: Eight, const B: usize, const U: usize>(line: &Line<B>, factor: f64) -> InLine<E, U> {
     InLine::of(line).scaled(factor)
 }
 
@@ -106,9 +106,14 @@ struct Forced<'a, const B: usize> {
     momentum: &'a mut [f64],
 }
 
-impl<E: Eight, const B: usize> Passage<E, B> for Forced<'_, B> {
+impl<E: Eight, const B: usize> Passage<E> for Forced<'_, B> {
     #[inline(always)]
-    fn pass(&mut self, at: usize, group: &Group, flow: InLine<E, B>) -> InLine<E, B> {
+    fn pass<const U: usize>(
+        &mut self,
+        at: usize,
+        group: &Group,
+        flow: InLine<E, U>,
+    ) -> InLine<E, U> {
         let OfGroup { axes, inverse, margins, among } = self.read.group(at, group);
         let (start, next) = (&self.start[group.rows.clone()], &self.next[group.rows.clone()]);
         let mut above = flow;
@@ -145,9 +150,14 @@ struct Moved<'a, const B: usize> {
     momentum: &'a mut [f64],
 }
 
-impl<E: Eight, const B: usize> Passage<E, B> for Moved<'_, B> {
+impl<E: Eight, const B: usize> Passage<E> for Moved<'_, B> {
     #[inline(always)]
-    fn pass(&mut self, at: usize, group: &Group, flow: InLine<E, B>) -> InLine<E, B> {
+    fn pass<const U: usize>(
+        &mut self,
+        at: usize,
+        group: &Group,
+        flow: InLine<E, U>,
+    ) -> InLine<E, U> {
         let OfGroup { axes, margins, among, .. } = self.read.group(at, group);
         let mut below = flow;
         for (margin, start) in margins.iter().zip(&self.start[group.rows.clone()]) {
@@ -205,9 +215,14 @@ struct WeighedMotion<'a, const B: usize> {
     next: &'a mut [f64],
 }
 
-impl<E: Eight, const B: usize> Passage<E, B> for WeighedMotion<'_, B> {
+impl<E: Eight, const B: usize> Passage<E> for WeighedMotion<'_, B> {
     #[inline(always)]
-    fn pass(&mut self, at: usize, group: &Group, flow: InLine<E, B>) -> InLine<E, B> {
+    fn pass<const U: usize>(
+        &mut self,
+        at: usize,
+        group: &Group,
+        flow: InLine<E, U>,
+    ) -> InLine<E, U> {
         let OfGroup { axes, margins, among, .. } = self.read.group(at, group);
         for (start, margin) in self.start[group.rows.clone()].iter_mut().zip(margins) {
             *start = along(&margin.above, flow);
@@ -238,9 +253,14 @@ struct WeighedForce<'a, const B: usize> {
     next: &'a mut [f64],
 }
 
-impl<E: Eight, const B: usize> Passage<E, B> for WeighedForce<'_, B> {
+impl<E: Eight, const B: usize> Passage<E> for WeighedForce<'_, B> {
     #[inline(always)]
-    fn pass(&mut self, at: usize, group: &Group, flow: InLine<E, B>) -> InLine<E, B> {
+    fn pass<const U: usize>(
+        &mut self,
+        at: usize,
+        group: &Group,
+        flow: InLine<E, U>,
+    ) -> InLine<E, U> {
         let OfGroup { axes, inverse, margins, among } = self.read.group(at, group);
         let (start, next) =
             (&mut self.start[group.rows.clone()], &mut self.next[group.rows.clone()]);

@@ -17,6 +17,7 @@ use crate::lagrangian::fields::Fields;
 use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::samples::{prescribe, rubbing};
 use crate::linearization::linearize::Linearization;
+use crate::model::mechanism::Acting;
 use crate::model::mechanism::{Model, Solver};
 use crate::plant::facade::Plant;
 use crate::plant::initial::Initial;
@@ -174,6 +175,25 @@ fn assert_generates(plant: &mut Plant) {
     let matrix = dense(model, &workspace.kkt.factored.tree);
     assert!(workspace.factor_recursion(model, settings).unwrap());
     assert_solves(workspace, model, &matrix);
+    assert_nudges(workspace, model);
+}
+
+/// What springs and forces make of a change of the motion by generators is what it is entry by entry.
+fn assert_nudges(workspace: &mut Workspace, model: &Model) {
+    let nd = model.dimensions.dynamic;
+    workspace.nudge.position = (0..nd).map(|i| wave(2 * i)).collect();
+    workspace.nudge.velocity = (0..nd).map(|i| wave(3 * i + 1)).collect();
+    let change = |workspace: &mut Workspace| {
+        workspace.step.impulse.fill(0.0);
+        workspace.nudge_elements(model, 0.1);
+        DVector::from_column_slice(&workspace.step.impulse)
+    };
+    let found = change(workspace);
+    let recursion = std::mem::replace(&mut workspace.kkt.factored.recursion, Recursion::None);
+    let expected = change(workspace);
+    workspace.kkt.factored.recursion = recursion;
+    let error = (&found - &expected).amax();
+    assert!(error <= 1e-12 * expected.amax(), "{error:e} of {:e}", expected.amax());
 }
 
 fn assert_solves(workspace: &mut Workspace, model: &Model, matrix: &DMatrix<f64>) {
@@ -550,7 +570,7 @@ fn what_acts_from_a_body_above_is_generated() {
         (5, pulled(&compiled(&rope(24, "")), ["f2", "f3"], &between(&along), &[])),
     ] {
         let model = Arc::new(model);
-        assert!(model.field_ends.as_ref().is_some_and(|ends| ends.contains(&true)));
+        assert!(model.acting.as_ref().is_some_and(|acting| acting.contains(&Acting::Ends)));
         let mut fast = move_alike(&model, steps);
         assert_generates(&mut fast);
     }

@@ -53,7 +53,7 @@ pub(crate) struct Margin<V> {
 impl<E: Eight, const B: usize> Margin<InLine<E, B>> {
     /// To memory.
     #[inline(always)]
-    pub(crate) fn put(self, to: &mut Margin<Line<B>>) {
+    pub(crate) fn put<const L: usize>(self, to: &mut Margin<Line<L>>) {
         self.carry.put(&mut to.carry);
         self.push.put(&mut to.push);
         self.above.put(&mut to.above);

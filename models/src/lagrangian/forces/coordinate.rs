@@ -3,6 +3,7 @@
 use plantd_math::scalar::Scalar;
 
 use crate::lagrangian::forces::GeneralizedForce;
+use crate::lagrangian::forces::linear_damper::FRICTION_CURVE;
 use crate::lagrangian::instant::Instant;
 use crate::model::mechanism::{CoordinateForce, CoordinateLaw};
 
@@ -42,6 +43,21 @@ impl GeneralizedForce for CoordinateForce {
             }
         };
         entry(self.coordinate, self.coordinate, by_q, by_v);
+    }
+
+    fn second_derivative(&self, at: &Instant<'_>, [moved, faster]: [f64; 2]) -> f64 {
+        let speed = at.velocity[self.coordinate].abs();
+        match self.law {
+            CoordinateLaw::Constant(_) => 0.0,
+            CoordinateLaw::Drag([c, d]) => (2.0 * c + 6.0 * d * speed) * faster * faster,
+            CoordinateLaw::Friction { force, velocity } => {
+                force * FRICTION_CURVE * (faster / velocity).powi(2)
+            }
+            CoordinateLaw::Stop(stop) => {
+                let [_, rising, bent] = stop.steepness(at.q[self.coordinate]);
+                stop.damping * moved * (bent * moved * speed + 2.0 * rising * faster)
+            }
+        }
     }
 }
 

@@ -12,6 +12,9 @@ use crate::lagrangian::forces::GeneralizedForce;
 use crate::lagrangian::instant::Instant;
 use crate::model::mechanism::{LinearDamper, LinearLaw};
 
+/// A bound of the second derivative of `tanh`.
+pub(super) const FRICTION_CURVE: f64 = 0.77;
+
 /// `force tanh(s / velocity)` and its slope.
 pub(super) fn friction<S: Scalar>(force: f64, velocity: f64, rate: S) -> (S, S) {
     let t = (rate * (1.0 / velocity)).tanh();
@@ -65,6 +68,12 @@ impl GeneralizedForce for LinearDamper {
                 entry(i, j, S::ZERO, slope * (-row * column));
             }
         }
+    }
+
+    fn second_derivative(&self, _: &Instant<'_>, [_, faster]: [f64; 2]) -> f64 {
+        let LinearLaw::Friction { force, velocity } = self.law else { return 0.0 };
+        let most = self.terms.iter().fold(0.0_f64, |most, (_, c)| most.max(c.abs()));
+        force * FRICTION_CURVE * most * (most * faster / velocity).powi(2)
     }
 
     fn for_each_input_derivative<S: Scalar>(

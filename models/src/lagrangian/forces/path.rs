@@ -13,10 +13,10 @@ use plantd_math::spatial::{Force, Vec3};
 
 use crate::lagrangian::fields::{Field, Take, at_point, change_at_point};
 use crate::lagrangian::forces::GeneralizedForce;
-use crate::lagrangian::forces::linear_damper::friction;
+use crate::lagrangian::forces::linear_damper::{FRICTION_CURVE, friction};
 use crate::lagrangian::forces::point::twist;
 use crate::lagrangian::instant::Instant;
-use crate::lagrangian::vectors::{Distance, moving_ends};
+use crate::lagrangian::vectors::{Distance, moving_ends, steepness_of};
 use crate::model::mechanism::{PathForce, PointPair, Resistance, Span, span};
 
 /// A path in motion.
@@ -65,6 +65,41 @@ impl PathForce {
     fn resists(&self) -> bool {
         !matches!(self.resistance, Resistance::Constant(0.0))
     }
+}
+
+/// Bounds of `|L̇|`, and of its first two derivatives along changes of coordinates and velocities.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct RateBounds {
+    pub(super) rate: f64,
+    pub(super) faster: f64,
+    pub(super) jerk: f64,
+}
+
+impl RateBounds {
+    /// Of a path whose length is as steep as that.
+    pub(super) fn new(
+        segments: &[PointPair],
+        [first, second, third]: [f64; 3],
+        at: &Instant<'_>,
+        [moved, faster]: [f64; 2],
+    ) -> Self {
+        let coordinates = segments.iter().flat_map(PointPair::coordinates);
+        let speed: f64 = coordinates.map(|i| at.velocity[i].abs()).sum();
+        Self {
+            rate: first * speed,
+            faster: moved * second * speed + faster * first,
+            jerk: moved * (moved * third * speed + 2.0 * faster * second),
+        }
+    }
+}
+
+/// A bound of the second derivative of `T L_i`, of those of the length and of `T`, `T'` and `T''`.
+pub(super) fn along(
+    [first, second, third]: [f64; 3],
+    [tension, change, curve]: [f64; 3],
+    moved: f64,
+) -> f64 {
+    curve * first + moved * (2.0 * change * second + moved * tension * third)
 }
 
 impl Field for PathForce {
@@ -140,6 +175,32 @@ impl GeneralizedForce for PathForce {
                 }
             });
         }
+    }
+
+    fn second_derivative(&self, at: &Instant<'_>, extent: [f64; 2]) -> f64 {
+        let [first, second, third] = steepness_of(self.segments(at));
+        let motion = RateBounds::new(&self.segments, [first, second, third], at, extent);
+        let RateBounds { rate, faster, jerk } = motion;
+        let driven = self.inputs.iter().map(|&(k, g)| at.inputs[k] * g).sum::<f64>().abs();
+        let longer = first * extent[0];
+        let [held, change, curve] = match self.resistance {
+            Resistance::Constant(c) => [c * rate, c * faster, c * jerk],
+            Resistance::Friction { force, velocity } => {
+                let slope = force / velocity;
+                let bent = FRICTION_CURVE * faster * faster / velocity;
+                [force, slope * faster, slope * (jerk + bent)]
+            }
+            Resistance::Stop(stop) => {
+                let mut length = 0.0;
+                self.segments(at).for_each(|segment| length += segment.length);
+                let [share, rising, bent] = stop.steepness(length).map(|w| w * stop.damping);
+                let curved = bent * longer * longer + rising * second * extent[0].powi(2);
+                let change = rising * longer * rate + share * faster;
+                let curve = curved * rate + 2.0 * rising * longer * faster + share * jerk;
+                [share * rate, change, curve]
+            }
+        };
+        along([first, second, third], [driven + held, change, curve], extent[0])
     }
 
     fn for_each_input_derivative<S: Scalar>(

@@ -13,8 +13,9 @@ use plantd_math::spatial::{Motion, Vec3};
 
 use crate::lagrangian::fields::{Field, Take, at_point, change_at_point};
 use crate::lagrangian::forces::GeneralizedForce;
+use crate::lagrangian::forces::path::{RateBounds, along};
 use crate::lagrangian::instant::Instant;
-use crate::lagrangian::vectors::Separation;
+use crate::lagrangian::vectors::{Distance, Separation};
 use crate::model::mechanism::{Carries, PathJoint, PointForce, PointLaw, Span};
 use crate::model::tree::{Attachment, WORLD};
 
@@ -105,6 +106,29 @@ impl GeneralizedForce for PointForce {
                     acting.force.dot(second) + row_gradient.dot(by_q),
                     row_gradient.dot(by_v),
                 );
+            }
+        }
+    }
+
+    fn second_derivative(&self, at: &Instant<'_>, extent: [f64; 2]) -> f64 {
+        let [moved, faster] = extent;
+        match self.law {
+            PointLaw::Damper(c) => {
+                let steepness = Distance::new(&self.ends, at.tree, at.poses).steepness();
+                let segment = std::slice::from_ref(&self.ends);
+                let RateBounds { rate, faster, jerk } =
+                    RateBounds::new(segment, steepness, at, extent);
+                along(steepness, [c * rate, c * faster, c * jerk], moved)
+            }
+            PointLaw::Drag(c) => {
+                let Acting { at: separation, rate, .. } = Acting::new(self, at);
+                let lever = self.ends.lever(at.tree, at.poses, &separation);
+                let speed: f64 = self.ends.coordinates().map(|i| at.velocity[i].abs()).sum();
+                let (rate, change) = (rate.norm(), lever * (moved * speed + faster));
+                let jerk = lever * moved * (moved * speed + 2.0 * faster);
+                let curve = 4.0 * change * change + 2.0 * rate * jerk;
+                let turned = 4.0 * moved * rate * change + (moved * rate).powi(2);
+                c * lever * (curve + turned)
             }
         }
     }

@@ -257,6 +257,31 @@ fn derivatives_are_those_of_the_forces() {
     }
 }
 
+/// Second derivatives along directions, by dual numbers, are within their bound, and not far below.
+#[test]
+fn second_derivatives_are_bounded() {
+    for (speed, [moved, faster]) in [(1.3, [0.5, 0.0]), (1e-2, [0.5, 30.0]), (30.0, [0.5, 1e3])] {
+        let mut case = Case::<Dual>::new(EVERYTHING, speed);
+        let n = case.q.len();
+        let direction: Vec<f64> = (0..n).map(|i| (2.3 * i as f64 + 0.4).sin()).collect();
+        let extent: f64 = direction.iter().map(|x| x.abs()).sum();
+        for (i, x) in direction.iter().enumerate() {
+            (case.q[i].eps, case.v[i].eps) = (moved * x / extent, faster * x / extent);
+        }
+        let [by_q, by_v, _] = case.derivatives();
+        let along = |row: &[Dual], changes: &[Dual]| -> f64 {
+            row.iter().zip(changes).map(|(slope, x)| slope.eps * x.eps).sum()
+        };
+        let rows = by_q.iter().zip(&by_v);
+        let second = rows.map(|(q, v)| (along(q, &case.q) + along(v, &case.v)).abs());
+        let most = second.fold(0.0, f64::max);
+        let bound = Case::<f64>::new(EVERYTHING, speed)
+            .with(|(forces, at)| forces.second_derivative(at, [moved, faster]));
+        println!("{most:e} {bound:e}");
+        assert!(most <= bound && bound < 1e5 * most, "{most:e} {bound:e}");
+    }
+}
+
 /// The forces are not zero, and a damper acts on what is beside its ends' common ancestors alone.
 #[test]
 fn every_part_is_there() {

@@ -88,6 +88,15 @@ impl GeneralizedForce for Wrench {
         }
     }
 
+    fn second_derivative(&self, at: &Instant<'_>, [moved, _]: [f64; 2]) -> f64 {
+        let wrench = self.total(at);
+        let (point, _) = at.poses.point(at.tree, &self.at);
+        let levers = self.path.iter().map(|joint| at.poses.point_gradient(at.tree, *joint, point));
+        let lever = levers.map(Vec3::norm).fold(0.0, f64::max);
+        let torque = (wrench.n - point.cross(wrench.f)).norm();
+        4.0 * moved * moved * (torque + 3.0 * lever * wrench.f.norm())
+    }
+
     fn for_each_input_derivative<S: Scalar>(
         &self,
         at: &Instant<'_, S>,

@@ -35,4 +35,8 @@ impl Potential for CoordinateSpring {
     ) {
         entry(self.coordinate, self.coordinate, S::constant(self.stiffness));
     }
+
+    fn third_derivative(&self, _: Place<'_, f64>) -> f64 {
+        0.0
+    }
 }

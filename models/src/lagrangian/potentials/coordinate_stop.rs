@@ -28,4 +28,8 @@ impl Potential for CoordinateStop {
     ) {
         entry(self.coordinate, self.coordinate, self.stop.curvature(at.q[self.coordinate]));
     }
+
+    fn third_derivative(&self, at: Place<'_, f64>) -> f64 {
+        self.stop.stiffness * self.stop.steepness(at.q[self.coordinate])[1]
+    }
 }

@@ -49,4 +49,8 @@ impl Potential for LinearSpring {
             }
         }
     }
+
+    fn third_derivative(&self, _: Place<'_, f64>) -> f64 {
+        0.0
+    }
 }

@@ -19,6 +19,9 @@ use crate::lagrangian::kinematics::Place;
 use crate::lagrangian::potentials::Potential;
 use crate::model::mechanism::OrientationSpring;
 
+/// Beyond so many radians nothing is said about third derivatives.
+const FAR: f64 = 2.5;
+
 impl OrientationSpring {
     /// `φ`.
     fn turn<S: Scalar>(&self, at: Place<'_, S>) -> Vec3<S> {
@@ -56,5 +59,10 @@ impl Potential for OrientationSpring {
             let value = change.0[column][row] * self.stiffness;
             entry(self.coordinate + row, self.coordinate + column, value);
         }
+    }
+
+    fn third_derivative(&self, at: Place<'_, f64>) -> f64 {
+        // `N⁻` and its derivative are bounded away from half a turn.
+        if self.turn(at).norm() < FAR { 4.0 * self.stiffness } else { f64::INFINITY }
     }
 }

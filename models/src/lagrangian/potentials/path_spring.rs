@@ -14,7 +14,7 @@ use crate::lagrangian::fields::{Field, Take, at_point, change_at_point};
 use crate::lagrangian::instant::Instant;
 use crate::lagrangian::kinematics::Place;
 use crate::lagrangian::potentials::Potential;
-use crate::lagrangian::vectors::{Distance, moving_ends};
+use crate::lagrangian::vectors::{Distance, moving_ends, steepness_of};
 use crate::model::mechanism::{PathLaw, PathSpring, PointPair, Span, span};
 
 impl PathSpring {
@@ -125,5 +125,19 @@ impl Potential for PathSpring {
                 }
             });
         }
+    }
+
+    fn third_derivative(&self, at: Place<'_, f64>) -> f64 {
+        let [first, second, third] = steepness_of(self.segments(at));
+        let length = self.length(at);
+        let tension = self.law.tension(length).abs();
+        let [stiffness, stiffening] = match &self.law {
+            PathLaw::Spring { stiffness, .. } => [*stiffness, 0.0],
+            PathLaw::Stop(stop) => {
+                let [share, rising, _] = stop.steepness(length);
+                [stop.stiffness * share, stop.stiffness * rising]
+            }
+        };
+        tension * third + 3.0 * stiffness * first * second + stiffening * first.powi(3)
     }
 }

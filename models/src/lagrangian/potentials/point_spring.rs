@@ -14,7 +14,7 @@ use crate::lagrangian::fields::{Field, Take, at_point, change_at_point};
 use crate::lagrangian::instant::Instant;
 use crate::lagrangian::kinematics::Place;
 use crate::lagrangian::potentials::Potential;
-use crate::lagrangian::vectors::Separation;
+use crate::lagrangian::vectors::{Distance, Separation};
 use crate::model::mechanism::{Carries, PointSpring, Span};
 
 /// A two-point spring at one configuration.
@@ -102,5 +102,17 @@ impl Potential for PointSpring {
             seconds.map(|second| s.tension * (product + s.at.difference.dot(second)) + along)
         };
         self.ends.for_each_pair((at.tree, at.poses, &s.at), value, entry);
+    }
+
+    fn third_derivative(&self, at: Place<'_, f64>) -> f64 {
+        let Place { tree, poses, .. } = at;
+        let distance = Distance::new(&self.ends, tree, poses);
+        let (k, length) = (self.stiffness, distance.length);
+        if self.rest_length == 0.0 {
+            let lever = self.ends.lever(tree, poses, &self.ends.separation(tree, poses));
+            return k * lever * (length + 3.0 * lever);
+        }
+        let [first, second, third] = distance.steepness();
+        k * (length - self.rest_length).abs() * third + 3.0 * k * first * second
     }
 }

@@ -33,4 +33,8 @@ impl Potential for SplineSpring {
         let stiffness = -self.force.slope(at.q[self.coordinate]);
         entry(self.coordinate, self.coordinate, stiffness);
     }
+
+    fn third_derivative(&self, _: Place<'_, f64>) -> f64 {
+        self.force.steepest()
+    }
 }
