@@ -183,13 +183,18 @@ impl<S: Planar> Nudge<S> {
 impl Workspace {
     /// What the last correction leaves of the residual, in units of its round-off.
     #[inline(never)]
-    pub(crate) fn foresee(&self, model: &Model, settings: &Settings, strayed: &mut Strayed) -> f64 {
+    pub(crate) fn foresee<const BODIES: bool>(
+        &self,
+        model: &Model,
+        settings: &Settings,
+        strayed: &mut Strayed,
+    ) -> f64 {
         let (h, round_off) = (settings.time_step_s, f64::EPSILON * self.residual.round_off);
         let (corrections, inertia) = (&self.residual.dynamics, &model.conditioning.inertia);
         let before = strayed.turned;
         let unit = round_off * h.abs();
         let left = strayed.left(corrections, &self.step.increment, inertia, unit);
-        if model.is_of_bodies() || left > BORNE_OUT {
+        if BODIES || left > BORNE_OUT {
             return left;
         }
         // `α_y α + α_y α + α²`.
@@ -223,7 +228,7 @@ impl Workspace {
     /// Moves the impulse on by the last correction, at the last factorization; but for
     /// [what is not of bodies](Self::nudge_elements).
     #[inline(never)]
-    pub(crate) fn nudge_impulse(&mut self, model: &Model, settings: &Settings) {
+    pub(crate) fn nudge_impulse<const BODIES: bool>(&mut self, model: &Model, settings: &Settings) {
         let h = settings.time_step_s;
         let Self { step, mid, balls, residual, kkt, nudge, .. } = self;
         let corrections = &residual.dynamics[..];
@@ -238,7 +243,7 @@ impl Workspace {
             }
         };
         nudge.move_on(model, &mut mid.mechanics, corrections, h, turn, &mut step.impulse);
-        if model.is_of_bodies() {
+        if BODIES {
             nudge.move_springs_on(model, h, &mut step.impulse);
         }
         if model.orientations.is_empty() {

@@ -307,7 +307,7 @@ impl Workspace {
                 break;
             }
             if let Some(strayed) = &mut strayed {
-                let left = self.foresee(model, settings, strayed);
+                let left = self.foresee::<BODIES>(model, settings, strayed);
                 let expected = chord.expected();
                 if is_negligible(left, expected)
                     && self.holds_constraints(model, state, &mut report)
@@ -324,7 +324,7 @@ impl Workspace {
             chord.is_idle = self.is_round_off_of_coordinates();
         }
         // Accept: p1 = D2Ld + F⁺.
-        self.accept(model, settings, report)
+        self.accept::<BODIES>(model, settings, report)
     }
 
     /// Constraint values `r2` at the current increment; returns their size in units of round-off.
@@ -368,7 +368,7 @@ impl Workspace {
     }
 
     /// Checks the solution, and finds its impulse.
-    fn accept(
+    fn accept<const BODIES: bool>(
         &mut self,
         model: &Model,
         settings: &Settings,
@@ -377,8 +377,8 @@ impl Workspace {
         model.check_turns(&self.step.increment)?;
         self.find_impulse(model, settings);
         if !self.step.is_evaluated {
-            self.nudge_impulse(model, settings);
-            if !model.is_of_bodies() {
+            self.nudge_impulse::<BODIES>(model, settings);
+            if !BODIES {
                 self.nudge_elements(model, settings.time_step_s);
             }
         }

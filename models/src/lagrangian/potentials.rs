@@ -236,7 +236,6 @@ mod tests {
             }
         }
         let mean = (ratios / f64::from(count)).exp();
-        println!("{count} samples, bounds on average {mean:.0} times what is there");
         assert!(count > 100 && mean < 1000.0, "{count} {mean}");
     }
 

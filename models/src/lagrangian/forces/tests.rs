@@ -277,7 +277,6 @@ fn second_derivatives_are_bounded() {
         let most = second.fold(0.0, f64::max);
         let bound = Case::<f64>::new(EVERYTHING, speed)
             .with(|(forces, at)| forces.second_derivative(at, [moved, faster]));
-        println!("{most:e} {bound:e}");
         assert!(most <= bound && bound < 1e5 * most, "{most:e} {bound:e}");
     }
 }
