@@ -123,6 +123,7 @@ fn assemble(scene: &Scene, layout: Layout) -> Model {
     let planar = if goes_to_space { None } else { planar(&dynamics, gravity) };
     let mut model = Model {
         acting: None,
+        impulses: 0,
         foresees_elements: false,
         conditioning: Conditioning::default(),
         initial_violations: Vec::new(),
@@ -154,6 +155,7 @@ fn assemble(scene: &Scene, layout: Layout) -> Model {
         scene: scene.clone(),
         warnings: Vec::new(),
     };
+    model.impulses = model.input_pattern().count();
     model.acting = model.find_acting();
     model.foresees_elements = model.is_generated_in_space() && !model.has_simple_elements();
     model.solver = Solver::of(&model);

@@ -116,7 +116,7 @@ impl StepDerivative {
             self.nd == d.dynamic
                 && self.nk == d.prescribed
                 && self.ni == d.inputs
-                && self.ends.inputs.len() == model.input_pattern().count(),
+                && self.ends.inputs.len() == model.impulses,
             "the derivative belongs to another model"
         );
         self.means = Means::Nothing;

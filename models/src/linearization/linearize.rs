@@ -214,7 +214,7 @@ impl Linearization {
                 && self.nk == d.prescribed
                 && self.constraints() == d.constraints
                 && self.ni == d.inputs
-                && self.ends.inputs.len() == model.input_pattern().count(),
+                && self.ends.inputs.len() == model.impulses,
             "the linearization belongs to another model"
         );
     }

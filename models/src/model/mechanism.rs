@@ -59,6 +59,8 @@ pub struct Model {
     pub(crate) mixed_pairs: Vec<MixedPair>,
     /// What acts on bodies across each joint. `None` where elements act across one joint from different bodies.
     pub(crate) acting: Option<Vec<Acting>>,
+    /// How many entries [`Model::input_pattern`] has.
+    pub(crate) impulses: usize,
     /// Whether the end of steps is foreseen with the springs and forces that it has beside
     /// [simple ones](Model::has_simple_elements).
     pub(crate) foresees_elements: bool,
