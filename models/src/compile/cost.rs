@@ -49,12 +49,16 @@ impl Model {
             Solver::Planar => (100.0 + 340.0 * joints, 110.0 + 88.0 * joints),
             Solver::Loops => (5.0 * fronts, 41.0 * rows),
             Solver::Spatial => {
-                let (factorization, correction) = match self.blocks() {
-                    Blocks::One => (1350.0, 93.0),
-                    Blocks::Two => (4300.0, 170.0),
-                    Blocks::Three => (9200.0, 247.0),
+                let (more, correction) = match self.blocks() {
+                    Blocks::One => (0.0, 0.0),
+                    Blocks::Two => (2950.0, 77.0),
+                    Blocks::Three => (7850.0, 154.0),
                 };
-                (100.0 + factorization * joints, 110.0 + correction * joints)
+                let acted_on = self.acted_on() as f64;
+                (
+                    100.0 + 1350.0 * joints + more * acted_on,
+                    110.0 + 93.0 * joints + correction * acted_on,
+                )
             }
         };
         let schur = 800.0 + 165.0 * nd * nc + 2.0 * nc.powi(3);

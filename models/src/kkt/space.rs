@@ -95,8 +95,8 @@ struct Limb {
     /// Where the sums of the limbs are that hang from its lowest joint.
     carries: Option<usize>,
     hangs_from: Option<Fork>,
-    /// Whether something acts across its joints. Where nothing does, all blocks but the first are zero, and nobody looks
-    /// at them.
+    /// Whether something acts across its joints. Where nothing does, all blocks of its vectors but the first would be
+    /// zero: nobody writes or reads them.
     is_acted_on: bool,
 }
 
@@ -594,7 +594,7 @@ fn write_within<E: Eight, const B: usize, const U: usize, const W: usize>(
     within: &mut Square,
 ) {
     for (a, above) in axes.iter().enumerate() {
-        let (minus, plus) = (InLine::<E, U>::of(&above.minus), InLine::<E, B>::of(&above.plus));
+        let (minus, plus) = (InLine::<E, U>::of(&above.minus), InLine::<E, U>::of(&above.plus));
         within[a][a] = minus.dot(InLine::of(&above.upper)) + diagonal[a];
         for (b, below) in axes.iter().enumerate().skip(a + 1) {
             within[a][b] = minus.dot(InLine::of(&below.upper));
