@@ -280,25 +280,33 @@ impl Workspace {
                 impulse[i] += h * (by_q * position[j] + by_v * velocity[j]);
             }
         };
+        let has_springs = model.potentials.any;
         if !matches!(kkt.factored.recursion, Recursion::Spatial(_)) {
-            model.for_each_spring_derivative(at.poses, at.q, |i, j, value| add(i, j, -value, 0.0));
+            if has_springs {
+                let mut add = |i, j, value: f64| add(i, j, -value, 0.0);
+                model.for_each_spring_derivative(at.poses, at.q, &mut add);
+            }
             if let Some(forces) = &model.forces {
                 forces.for_each_derivative(&at, add);
             }
             return;
         }
-        model.for_each_own_spring_derivative(at.poses, at.q, |i, value| add(i, i, -value, 0.0));
+        if has_springs {
+            model.for_each_own_spring_derivative(at.poses, at.q, |i, value| add(i, i, -value, 0.0));
+        }
         if let Some(forces) = &model.forces {
             forces.for_each_own_derivative(&at, |i, by_q, by_v| add(i, i, by_q, by_v));
         }
-        mid.for_each_own_torque(model, (kkt.fields.as_deref(), 1.0), |o, own| {
-            let first = model.orientations[o];
-            for (row, column) in (0..9).map(|entry| (entry / 3, entry % 3)) {
-                let OwnTorque { by_turn, by_velocity } = own;
-                let [by_q, by_v] = [by_turn, by_velocity].map(|by| by.0[column][row]);
-                add(first + row, first + column, by_q, by_v);
-            }
-        });
+        if !model.orientations.is_empty() {
+            mid.for_each_own_torque(model, (kkt.fields.as_deref(), 1.0), |o, own| {
+                let first = model.orientations[o];
+                for (row, column) in (0..9).map(|entry| (entry / 3, entry % 3)) {
+                    let OwnTorque { by_turn, by_velocity } = own;
+                    let [by_q, by_v] = [by_turn, by_velocity].map(|by| by.0[column][row]);
+                    add(first + row, first + column, by_q, by_v);
+                }
+            });
+        }
         if let Some(fields) = &mut kkt.fields {
             let curvature = &mid.mechanics.curvature;
             fields.add_change(model, curvature, [position, velocity], h, impulse);
@@ -310,12 +318,15 @@ impl Midpoint {
     /// A bound of the second derivative of `L_q + f` along changes of the increment whose magnitudes sum up to one, as
     /// far as springs and forces make it.
     fn curve(&self, model: &Model, h: f64) -> f64 {
-        let (at, moved) = (self.instant(model), 0.5);
-        let Instant { tree, poses, q, .. } = at;
-        let springs = model.third_spring_derivative(Place { tree, poses, q });
-        let forces =
-            model.forces.iter().map(|forces| forces.second_derivative(&at, [moved, 1.0 / h.abs()]));
-        moved * moved * springs + forces.sum::<f64>()
+        let (at, moved, mut sum) = (self.instant(model), 0.5, 0.0);
+        if model.potentials.any {
+            let Instant { tree, poses, q, .. } = at;
+            sum += moved * moved * model.third_spring_derivative(Place { tree, poses, q });
+        }
+        if let Some(forces) = &model.forces {
+            sum += forces.second_derivative(&at, [moved, 1.0 / h.abs()]);
+        }
+        sum
     }
 }
 
