@@ -128,16 +128,15 @@ impl Solver {
     /// Many axes one below the other are for generators. Where not much is at stake, entries it is: plants
     /// that are solved entry by entry can go side by side.
     const DEEP: usize = 6;
-    /// The same where something acts on bodies from the world or from bodies above, and vectors are twice as long:
+    /// The same for joints across which something acts from the world or from bodies above, and whose vectors are twice as
+    /// long; all others have those that they have without:
     ///
     /// ```text
-    /// quadruped with a push, of 6.5 entries       1.0 to 1.3
-    /// rope of 16 with a spring, of 8.5            0.8
-    /// humanoid with a push, of 9.7 entries        0.9 to 1.1, with drag on a hand 0.55
-    /// rope of 24, 32, 64 and 128 with a spring    0.58, 0.47, 0.22, 0.10
-    /// the same, between two of its bodies         1.04, 0.86, 0.46, 0.19
+    /// quadruped with a push or a spring on a foot, of 6.5 entries     0.65, 0.62
+    /// rope of 24, 32, 64 and 128 with a spring                        0.58, 0.47, 0.22, 0.10
+    /// the same, between two of its bodies                             1.04, 0.86, 0.46, 0.19
     /// ```
-    const DEEP_WITH_FIELDS: usize = 8;
+    const DEEP_WITH_FIELDS: usize = 6;
     /// And where they are three times as long: a rope of 24, 32, 64 and 128 with a damper between two of its bodies took
     /// 1.47, 1.21, 0.67 and 0.27.
     const DEEP_WITH_RATES: usize = 18;
