@@ -15,9 +15,9 @@ use crate::compile::pattern::{couplings, joint_pairs};
 use crate::compile::{inertia, pattern, settling};
 use crate::model::conditioning::Conditioning;
 use crate::model::mechanism::{
-    Alignment, AlongAxis, Armature, Blocks, Carries, Constraint, ConstraintKind, Coordinate,
-    Coupling, Dimensions, Forces, Length, Model, Mover, OperatingPoint, PathJoint, PathLength,
-    PointDistance, PointPair, Polynomial, Product, Solver, Vector,
+    Alignment, AlongAxis, Armature, Carries, Constraint, ConstraintKind, Coordinate, Coupling,
+    Dimensions, Forces, Length, Model, Mover, OperatingPoint, PathJoint, PathLength, PointDistance,
+    PointPair, Polynomial, Product, Solver, Vector,
 };
 use crate::model::planar_tree::{crooked, planar};
 use crate::model::site::Site;
@@ -118,8 +118,7 @@ fn assemble(scene: &Scene, layout: Layout) -> Model {
     // 0.75 of the time, one of 64 a quarter.
     let is_moved = dynamics.joints.iter().any(|joint| joint.coordinate >= dynamic);
     let is_free = dimensions.constraints == 0;
-    let goes_to_space =
-        needs_poses || (is_moved && is_free && Solver::is_deep(&elimination, (0, Blocks::One)));
+    let goes_to_space = needs_poses || (is_moved && is_free && Solver::is_deep(&elimination, 0));
     let planar = if goes_to_space { None } else { planar(&dynamics, gravity) };
     let mut model = Model {
         acting: None,

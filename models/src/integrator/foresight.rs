@@ -335,12 +335,26 @@ mod tests {
     use std::sync::Arc;
 
     use super::*;
-    use crate::integrator::workspace::StepContext;
     use crate::model::mechanism::Solver;
     use crate::plant::facade::Plant;
     use crate::plant::initial::Initial;
     use plantd_math::norms::largest;
     use plantd_scene::builtin;
+
+    /// The residual that a solution leaves, where it was not looked at, and how far its impulse is from what it is there,
+    /// both in units of round-off.
+    fn look(plant: &mut Plant) -> Option<[f64; 2]> {
+        let Plant { model, settings, state, workspace, .. } = plant;
+        if workspace.step.is_evaluated {
+            return None;
+        }
+        let impulse = workspace.step.impulse.clone();
+        let size = workspace.evaluate(model, settings, state);
+        workspace.find_impulse(model, settings);
+        let apart: Vec<f64> =
+            impulse.iter().zip(&workspace.step.impulse).map(|(a, b)| a - b).collect();
+        Some([size, largest(&apart) / (f64::EPSILON * workspace.residual.round_off)])
+    }
 
     /// What was not looked at is what it was taken for: residual and impulse at the solution, in motions that go
     /// on by themselves, and in those that are pushed anew at each step.
@@ -381,18 +395,10 @@ mod tests {
                     u.iter_mut().zip(0..).for_each(|(u, i)| *u = f64::from(k * k + i).sin());
                 }
                 plant.solve(&u, None).unwrap();
-                let Plant { model, state, workspace, .. } = &mut plant;
-                let report = workspace.step.report;
-                if !workspace.step.is_evaluated {
+                let report = plant.workspace.step.report;
+                if let Some([size, apart]) = look(&mut plant) {
                     unseen += 1;
-                    let impulse = workspace.step.impulse.clone();
-                    let at = StepContext { model, settings: &settings, state, u: &u };
-                    let size = workspace.evaluate(at.model, at.settings, at.state);
                     assert!(report.residual <= UNSEEN && size < floor, "{name}: {size}");
-                    workspace.find_impulse(model, &settings);
-                    let apart: Vec<f64> =
-                        impulse.iter().zip(&workspace.step.impulse).map(|(a, b)| a - b).collect();
-                    let apart = largest(&apart) / (f64::EPSILON * workspace.residual.round_off);
                     assert!(apart < 1.0, "{name}: {apart}");
                 }
                 plant.commit();
@@ -483,7 +489,6 @@ cubic = 0.1
                 let settings = Settings { time_step_s: 0.002, ..Settings::new(&model) };
                 Plant::new(Arc::new(model), settings).unwrap()
             });
-            let settings = plant.settings;
             let n = plant.model.dimensions.coordinates();
             let q = plant.state.q.clone();
             let v: Vec<f64> = (0..n).map(|i| (1.7 * i as f64).sin()).collect();
@@ -495,15 +500,8 @@ cubic = 0.1
             for _ in 0..200 {
                 looked_at.step(&u).unwrap();
                 plant.solve(&u, None).unwrap();
-                let Plant { model, state, workspace, .. } = &mut plant;
-                if !workspace.step.is_evaluated {
+                if let Some([size, apart]) = look(&mut plant) {
                     unseen += 1;
-                    let impulse = workspace.step.impulse.clone();
-                    let size = workspace.evaluate(model, &settings, state);
-                    workspace.find_impulse(model, &settings);
-                    let apart: Vec<f64> =
-                        impulse.iter().zip(&workspace.step.impulse).map(|(a, b)| a - b).collect();
-                    let apart = largest(&apart) / (f64::EPSILON * workspace.residual.round_off);
                     assert!(size < 64.0 && apart < 1.0, "{size} {apart}");
                 }
                 plant.commit();

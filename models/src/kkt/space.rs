@@ -288,7 +288,7 @@ fn limbs(tree: &Tree, nd: usize, acting: &[Acting]) -> (Vec<Limb>, Vec<Group>, u
     }
     // Forks on the way to each joint, which are the places of its own one: what is below a joint is done
     // with before the next one needs the place. Where elements begin to act, limbs meet, too.
-    let is_acted_on = |i: usize| acting.get(i).is_some_and(|acting| *acting != Acting::Nothing);
+    let is_acted_on = |i: usize| acting.get(i).is_some_and(|acting| acting.is_any());
     let (mut forks, mut is_fork) = (vec![0; joints.len()], vec![false; joints.len()]);
     for (i, joint) in joints.iter().enumerate() {
         if let Some(count) = children.get_mut(joint.parent) {

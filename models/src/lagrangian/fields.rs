@@ -191,7 +191,7 @@ impl Model {
 
     /// Across how many joints something acts.
     pub(crate) fn acted_on(&self) -> usize {
-        self.acting.iter().flatten().filter(|acting| **acting != Acting::Nothing).count()
+        self.acting.iter().flatten().filter(|acting| acting.is_any()).count()
     }
 }
 
@@ -308,7 +308,7 @@ impl InEights for Gather<'_> {
         let Self { fields: Fields { sums, places, given, has_rates, .. }, acting, at } = self;
         let mut sum = Sum::default();
         let joints = at.tree.joints.iter().zip(acting).enumerate().rev();
-        for (i, (joint, acting)) in joints.filter(|(_, (_, acting))| **acting != Acting::Nothing) {
+        for (i, (joint, acting)) in joints.filter(|(_, (_, acting))| acting.is_any()) {
             if let Some(own) = sums.get(places[i]) {
                 sum.add::<E>(own);
             }
@@ -369,18 +369,16 @@ impl InEights for Change<'_> {
         };
         let rest = [Block::ZERO; 2];
         let joints = tree.joints.iter().zip(acting).enumerate();
-        let acted_on = joints.filter(|(_, (_, acting))| **acting != Acting::Nothing);
-        let is_first =
-            |joint: usize, parent: usize| parent == WORLD || acting[joint] == Acting::Ends;
+        let acted_on = joints.filter(|(_, (_, acting))| acting.is_any());
+        // Whether nothing passes between a joint and its parent.
+        let is_apart =
+            |joint: usize| tree.joints[joint].parent == WORLD || acting[joint] == Acting::Ends;
         for (i, (joint, _)) in acted_on.clone() {
-            let [moved, faster] = match joint.parent {
-                parent if is_first(i, parent) => &rest,
-                parent => &passed[parent].down,
-            };
+            let above = if is_apart(i) { rest } else { passed[joint.parent].down };
             let [a, b] = changes(joint.coordinate);
             let (axis, rate) = (E::of(&curvature.axis[i]), E::of(&curvature.rate[i]));
-            let moved = E::of(moved).plus(axis.scaled(a));
-            let faster = E::of(faster).plus(rate.scaled(a)).plus(axis.scaled(b));
+            let moved = E::of(&above[0]).plus(axis.scaled(a));
+            let faster = E::of(&above[1]).plus(rate.scaled(a)).plus(axis.scaled(b));
             let own = &mut passed[i];
             moved.put(&mut own.down[0]);
             faster.put(&mut own.down[1]);
@@ -393,19 +391,17 @@ impl InEights for Change<'_> {
             let all = E::of(&passed[i].up).plus(own);
             // Of a ball joint, what is above all of its axes, and below all.
             let [first, last] = [joint.first_axis(i), joint.last_axis(i)];
-            let [moved, faster] = match tree.joints[first].parent {
-                parent if is_first(first, parent) => &rest,
-                parent => &passed[parent].down,
-            };
+            let parent = tree.joints[first].parent;
+            let [moved, faster] = if is_apart(first) { rest } else { passed[parent].down };
             let mut below = passed[last].up;
             if first == last {
                 all.put(&mut below);
             }
             if let Some(force) = self.force.get_mut(joint.coordinate) {
-                let from_above = E::dot_of(turn, moved) + E::dot_of(back, faster);
+                let from_above = E::dot_of(turn, &moved) + E::dot_of(back, &faster);
                 *force += self.weight * (from_above + E::dot_of(&curvature.axis[i], &below));
             }
-            if !is_first(i, joint.parent) {
+            if !is_apart(i) {
                 let up = &mut passed[joint.parent].up;
                 E::of(up).plus(all).put(up);
             }

@@ -181,11 +181,16 @@ impl PointPair {
     }
 }
 
-/// Sums of what the segments of a path have.
-pub(crate) fn steepness_of<'a>(segments: impl Iterator<Item = Distance<'a, f64>>) -> [f64; 3] {
-    segments
-        .map(|segment| segment.steepness())
-        .fold([0.0; 3], |[a, b, c], [own_a, own_b, own_c]| [a + own_a, b + own_b, c + own_c])
+/// The length of a path, and the sums of the bounds that its segments have.
+pub(crate) fn steepness_of<'a>(
+    segments: impl Iterator<Item = Distance<'a, f64>>,
+) -> (f64, [f64; 3]) {
+    let (mut length, mut sums) = (0.0, [0.0; 3]);
+    for segment in segments {
+        length += segment.length;
+        sums.iter_mut().zip(segment.steepness()).for_each(|(sum, own)| *sum += own);
+    }
+    (length, sums)
 }
 
 /// The end of a segment that all joints between its points carry.

@@ -102,6 +102,13 @@ pub(crate) enum Acting {
     Ends,
 }
 
+impl Acting {
+    /// Whether something does.
+    pub(crate) fn is_any(self) -> bool {
+        self != Self::Nothing
+    }
+}
+
 /// How many blocks the vectors of joints in space have.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Blocks {
@@ -127,32 +134,23 @@ impl Solver {
     ///
     /// Many axes one below the other are for generators. Where not much is at stake, entries it is: plants
     /// that are solved entry by entry can go side by side.
-    const DEEP: usize = 6;
-    /// The same for joints across which something acts from the world or from bodies above, and whose vectors are twice as
-    /// long; all others have those that they have without:
+    ///
+    /// It is as many where something acts across joints, from the world or from bodies above, and vectors of these are
+    /// twice as long:
     ///
     /// ```text
     /// quadruped with a push or a spring on a foot, of 6.5 entries     0.65, 0.62
     /// rope of 24, 32, 64 and 128 with a spring                        0.58, 0.47, 0.22, 0.10
     /// the same, between two of its bodies                             1.04, 0.86, 0.46, 0.19
     /// ```
-    const DEEP_WITH_FIELDS: usize = 6;
-    /// And where they are three times as long: a rope of 24, 32, 64 and 128 with a damper between two of its bodies took
-    /// 1.47, 1.21, 0.67 and 0.27.
+    const DEEP: usize = 6;
+    /// The same for joints whose vectors are three times as long: a rope of 24, 32, 64 and 128 with a damper between two
+    /// of its bodies took 1.47, 1.21, 0.67 and 0.27.
     const DEEP_WITH_RATES: usize = 18;
 
-    /// Whether generators are faster in space, where something acts across so many joints and vectors have so many blocks
-    /// there.
-    pub(crate) fn is_deep(
-        elimination: &SymbolicElimination,
-        (acted_on, blocks): (usize, Blocks),
-    ) -> bool {
-        let least = match blocks {
-            Blocks::One => Self::DEEP,
-            Blocks::Two => Self::DEEP_WITH_FIELDS,
-            Blocks::Three => Self::DEEP_WITH_RATES,
-        };
-        let more = acted_on * (least - Self::DEEP);
+    /// Whether generators are faster in space, where vectors of so many joints are three times as long.
+    pub(crate) fn is_deep(elimination: &SymbolicElimination, with_rates: usize) -> bool {
+        let more = with_rates * (Self::DEEP_WITH_RATES - Self::DEEP);
         elimination.entries() > Self::DEEP * elimination.rows() + more
     }
 
@@ -160,8 +158,8 @@ impl Solver {
     pub(crate) fn of(model: &Model) -> Self {
         let d = model.dimensions;
         if model.is_generated_in_space() {
-            let acted_on = (model.acted_on(), model.blocks());
-            let is_deep = Self::is_deep(&model.elimination, acted_on);
+            let with_rates = if model.blocks() == Blocks::Three { model.acted_on() } else { 0 };
+            let is_deep = Self::is_deep(&model.elimination, with_rates);
             return if is_deep { Self::Spatial } else { Self::Tree };
         }
         let is_free = d.constraints == 0 && d.prescribed == 0 && model.joints_are_in_order();

@@ -178,7 +178,7 @@ impl GeneralizedForce for PathForce {
     }
 
     fn second_derivative(&self, at: &Instant<'_>, extent: [f64; 2]) -> f64 {
-        let [first, second, third] = steepness_of(self.segments(at));
+        let (length, [first, second, third]) = steepness_of(self.segments(at));
         let motion = RateBounds::new(&self.segments, [first, second, third], at, extent);
         let RateBounds { rate, faster, jerk } = motion;
         let driven = self.inputs.iter().map(|&(k, g)| at.inputs[k] * g).sum::<f64>().abs();
@@ -191,8 +191,6 @@ impl GeneralizedForce for PathForce {
                 [force, slope * faster, slope * (jerk + bent)]
             }
             Resistance::Stop(stop) => {
-                let mut length = 0.0;
-                self.segments(at).for_each(|segment| length += segment.length);
                 let [share, rising, bent] = stop.steepness(length).map(|w| w * stop.damping);
                 let curved = bent * longer * longer + rising * second * extent[0].powi(2);
                 let change = rising * longer * rate + share * faster;

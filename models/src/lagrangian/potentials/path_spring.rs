@@ -128,8 +128,7 @@ impl Potential for PathSpring {
     }
 
     fn third_derivative(&self, at: Place<'_, f64>) -> f64 {
-        let [first, second, third] = steepness_of(self.segments(at));
-        let length = self.length(at);
+        let (length, [first, second, third]) = steepness_of(self.segments(at));
         let tension = self.law.tension(length).abs();
         let [stiffness, stiffening] = match &self.law {
             PathLaw::Spring { stiffness, .. } => [*stiffness, 0.0],

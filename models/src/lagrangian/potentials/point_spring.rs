@@ -108,11 +108,10 @@ impl Potential for PointSpring {
         let Place { tree, poses, .. } = at;
         let distance = Distance::new(&self.ends, tree, poses);
         let (k, length) = (self.stiffness, distance.length);
-        if self.rest_length == 0.0 {
-            let lever = self.ends.lever(tree, poses, &self.ends.separation(tree, poses));
-            return k * lever * (length + 3.0 * lever);
-        }
         let [first, second, third] = distance.steepness();
+        if self.rest_length == 0.0 {
+            return k * first * (length + 3.0 * first);
+        }
         k * (length - self.rest_length).abs() * third + 3.0 * k * first * second
     }
 }
