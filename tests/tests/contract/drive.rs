@@ -83,11 +83,7 @@ async fn a_lease_is_held_without_a_stream_of_inputs() {
     }
 
     drop(lease);
-    let deadline = Instant::now() + Duration::from_secs(30);
-    while !client.get_plant(&id).await.unwrap().plant.unwrap().driver.is_empty() {
-        assert!(Instant::now() < deadline, "the lease is never given up");
-        tokio::time::sleep(Duration::from_millis(5)).await;
-    }
+    undriven(&client, &id).await;
     let set = client.set_input(input(token, &[1.0])).await;
     assert_refused(set, Code::FailedPrecondition, "LEASE_LOST", "");
 }

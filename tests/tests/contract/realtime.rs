@@ -370,6 +370,7 @@ async fn a_watchdog_acts_whoever_takes_the_steps() {
     };
     assert!(error.to_string().contains("watchdog 0"), "{error}");
     drop(driver);
+    undriven(&client, &id).await;
     client.reset(&id).await.unwrap();
     client.run(run_request(&id, v1::Pace::Free, 0.0, 0)).await.unwrap();
     let mut driver = client.drive(&id).await.unwrap();

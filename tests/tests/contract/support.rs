@@ -34,6 +34,16 @@ pub(crate) async fn plant(client: &Client, model: &str) -> v1::PlantInfo {
     client.create_plant(request).await.unwrap()
 }
 
+/// Waits until nobody drives the plant: the server sees after a while that a driver has gone.
+pub(crate) async fn undriven(client: &Client, id: &str) {
+    let free = async {
+        while !client.get_plant(id).await.unwrap().plant.unwrap().driver.is_empty() {
+            tokio::task::yield_now().await;
+        }
+    };
+    soon(free).await;
+}
+
 /// Asserts that a call was refused with this code and reason, and that one of the faults it names
 /// is `field`; an empty field means that no fault of the request is named.
 #[track_caller]

@@ -157,14 +157,7 @@ async fn a_watchdog_names_its_quantity_its_bound_and_the_way_on() {
         assert_eq!((told, bound), (guarded, max));
         assert!(value > max && sentence.contains("Reset"), "{sentence}");
         drop(driver);
-
-        // The link's lease is free when its worker has seen that nobody is there.
-        let free = async {
-            while !client.get_plant(&id).await.unwrap().plant.unwrap().driver.is_empty() {
-                tokio::task::yield_now().await;
-            }
-        };
-        soon(free).await;
+        undriven(&client, &id).await;
         let mut driver = client.drive(&id).await.unwrap();
         let error = driver.step(&[20.0]).await.unwrap_err().to_string();
         let parts =

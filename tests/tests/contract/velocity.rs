@@ -51,7 +51,7 @@ async fn every_state_of_a_plant_has_the_velocity_of_its_momentum() {
         assert_eq!(soon(watch.next()).await.unwrap().unwrap().state.as_ref(), Some(state));
     }
     assert_eq!(state(&client, &id).await, states[6]);
-    drop(driver);
+    driver.close().await.unwrap();
 
     let snapshot = client.snapshot(&id).await.unwrap();
     assert_eq!(client.reset(&id).await.unwrap(), start);
