@@ -3,7 +3,7 @@
 
 use crate::elimination::SymbolicElimination;
 use crate::rows::{LANES, Term, add_rows_portable, padded};
-use crate::scalar::{Beside, Compared, LanesOf, Scalar, Wide};
+use crate::scalar::{Beside, Compared, LanesOf, Scalar, Wide, alone};
 use crate::simd::widest;
 
 /// A matrix that couples each row only with its ancestors, and its factorization in place.
@@ -47,6 +47,7 @@ impl<S: Compared> SmallestPivot<S> {
 /// What [`TreeLu::factor`] does.
 struct Factor<'a, S: Scalar> {
     matrix: &'a mut TreeLu<S>,
+    rows: usize,
     elimination: &'a SymbolicElimination,
     scale: &'a [f64],
     factor: f64,
@@ -57,17 +58,17 @@ impl<S: Compared> Beside<S> for Factor<'_, S> {
 
     #[inline(always)]
     fn run<W: Wide<S>>(self) -> SmallestPivot<S> {
-        let Self { matrix, elimination, scale, factor } = self;
+        let Self { matrix, rows, elimination, scale, factor } = self;
         let TreeLu { upper, lower, inverse_pivot, reference, .. } = matrix;
-        for ((reference, end), scale) in
-            reference.iter_mut().zip(&elimination.offsets[1..]).zip(scale)
-        {
+        let offsets = &elimination.offsets[..=rows];
+        let (inverse_pivot, reference) = (&mut inverse_pivot[..rows], &mut reference[..rows]);
+        for ((reference, end), scale) in reference.iter_mut().zip(&offsets[1..]).zip(scale) {
             *reference = upper[end - 1].abs().max(S::constant(scale * factor));
         }
         let mut smallest = SmallestPivot::NONE;
-        for k in (0..elimination.rows()).rev() {
-            let start = elimination.offsets[k];
-            let ancestors = &elimination.ancestors[start..elimination.offsets[k + 1] - 1];
+        for k in (0..rows).rev() {
+            let start = offsets[k];
+            let ancestors = &elimination.ancestors[start..offsets[k + 1] - 1];
             let depth = ancestors.len();
             let (upper_above, upper_row) = upper.split_at_mut(start);
             let (lower_above, lower_row) = lower.split_at_mut(start);
@@ -79,7 +80,7 @@ impl<S: Compared> Beside<S> for Factor<'_, S> {
                 *entry = *entry * inverse;
             }
             for (d, &ancestor) in ancestors.iter().enumerate().rev() {
-                let target = elimination.offsets[ancestor];
+                let target = offsets[ancestor];
                 let (l, u) = (lower_row[d], upper_row[d]);
                 W::subtract(l, &upper_row[..=d], &mut upper_above[target..=target + d]);
                 W::subtract(u, &lower_row[..d], &mut lower_above[target..target + d]);
@@ -137,7 +138,8 @@ impl<S: Compared> TreeLu<S> {
         scale: &[f64],
         factor: f64,
     ) -> SmallestPivot<S> {
-        S::beside(elimination.rows(), Factor { matrix: self, elimination, scale, factor })
+        let rows = elimination.rows();
+        S::beside(rows, Factor { matrix: self, rows, elimination, scale, factor })
     }
 
     /// Solves `K x = b` in place.
@@ -149,8 +151,10 @@ impl<S: Compared> TreeLu<S> {
     /// [`Self::solve`] in the registers of the caller.
     #[inline(always)]
     pub fn substitute(&self, elimination: &SymbolicElimination, x: &mut [S]) {
-        for k in (0..elimination.rows()).rev() {
-            let range = elimination.offsets[k]..elimination.offsets[k + 1] - 1;
+        let rows = x.len();
+        let (offsets, inverse_pivot) = (&elimination.offsets[..=rows], &self.inverse_pivot[..rows]);
+        for k in (0..rows).rev() {
+            let range = offsets[k]..offsets[k + 1] - 1;
             let value = x[k];
             for (&ancestor, u) in
                 elimination.ancestors[range.clone()].iter().zip(&self.upper[range])
@@ -158,15 +162,15 @@ impl<S: Compared> TreeLu<S> {
                 x[ancestor] -= *u * value;
             }
         }
-        for k in 0..elimination.rows() {
-            let range = elimination.offsets[k]..elimination.offsets[k + 1] - 1;
+        for k in 0..rows {
+            let range = offsets[k]..offsets[k + 1] - 1;
             let mut value = x[k];
             for (&ancestor, l) in
                 elimination.ancestors[range.clone()].iter().zip(&self.lower[range])
             {
                 value -= *l * x[ancestor];
             }
-            x[k] = value * self.inverse_pivot[k];
+            x[k] = value * inverse_pivot[k];
         }
     }
 }
@@ -203,6 +207,18 @@ impl<const N: usize> TreeLu<LanesOf<N>> {
 }
 
 impl TreeLu {
+    /// [`Self::factor`] number by number, in the code of the caller; `rows` are all, where a compiler can know how many.
+    #[inline(always)]
+    pub fn factor_few(
+        &mut self,
+        rows: usize,
+        elimination: &SymbolicElimination,
+        scale: &[f64],
+        factor: f64,
+    ) -> SmallestPivot {
+        alone(Factor { matrix: self, rows, elimination, scale, factor })
+    }
+
     /// Solves `K X = B` in place for the first columns of a row-major matrix; `columns` and `stride`
     /// are whole blocks.
     pub fn solve_rows(

@@ -3,7 +3,7 @@
 //! Read [`residual`] first: it has the equations. [`newton`] solves them, from the guess of [`predictor`] and [`push`], at
 //! the [`midpoint`], with matrices that [`matrix`] fills and [`crate::kkt`] factors; [`balls`] replaces
 //! coordinates of ball joints by orientations. [`collocation`] is the method of higher orders, of which
-//! [`scheme`] has the coefficients. [`abreast`] takes steps of several plants side by side.
+//! [`scheme`] has the coefficients. [`abreast`] takes steps of several plants side by side, [`few`] those of a few joints.
 
 pub(crate) mod abreast;
 pub(crate) mod ball_maps;
@@ -11,6 +11,7 @@ pub(crate) mod balls;
 pub(crate) mod blocks;
 pub(crate) mod collocation;
 pub(crate) mod explain;
+pub(crate) mod few;
 pub(crate) mod foresight;
 pub(crate) mod matrix;
 pub(crate) mod midpoint;

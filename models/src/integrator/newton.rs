@@ -113,6 +113,9 @@ impl Workspace {
     /// Solves one step; the solution stays in the workspace, with its report.
     #[inline]
     pub(crate) fn solve(&mut self, at: StepContext<'_>) -> Result<(), StepError> {
+        if self.solve_few(at).is_some() {
+            return Ok(());
+        }
         if at.model.is_of_bodies() { self.solve_as::<true>(at) } else { self.solve_as::<false>(at) }
     }
 

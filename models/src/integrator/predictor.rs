@@ -191,6 +191,7 @@ impl Past {
     }
 
     /// Writes the increments of the next step; false if there is nothing to guess from.
+    #[inline(always)]
     pub(crate) fn predict(&self, increments: &mut [f64]) -> bool {
         if self.kind != Kind::Increments || self.known == 0 {
             return false;
@@ -228,7 +229,7 @@ impl Past {
 
     /// Takes note of a step. The error of all coordinates is weighed by their `inertia`; `pushed`, if it is not empty,
     /// is what was guessed of the change of the inputs.
-    #[inline(never)]
+    #[inline(always)]
     pub(crate) fn record(
         &mut self,
         increments: &[f64],
@@ -239,7 +240,7 @@ impl Past {
         if self.kind != Kind::Increments {
             return;
         }
-        let rows = self.numbers.as_chunks_mut::<LENGTH>().0;
+        let rows = &mut self.numbers.as_chunks_mut::<LENGTH>().0[..increments.len()];
         let counts = [self.known.into(), evaluations.into()];
         let [known, order] = take_note(rows, increments, inertia, pushed, counts);
         (self.known, self.order) = (known as u8, order as u8);

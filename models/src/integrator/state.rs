@@ -121,6 +121,7 @@ impl PreciseState {
 }
 
 /// Adds changes to sums, with what rounding took from them.
+#[inline(always)]
 pub(crate) fn add<S: Scalar>(sums: &mut [S], low: &mut [S], changes: &[S]) {
     for ((sum, low), change) in sums.iter_mut().zip(low).zip(changes) {
         (*sum, *low) = two_sum(*sum, *change + *low);

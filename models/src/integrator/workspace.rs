@@ -40,6 +40,8 @@ pub(crate) struct Workspace {
     /// How the last correction changes the gradient.
     pub(crate) nudge: Nudge,
     pub(crate) response: Response,
+    /// Joints, where steps are [those of a few](super::few), else zero.
+    pub(crate) few_joints: usize,
 }
 
 /// The unknowns of a step, and where they lead.
@@ -164,6 +166,7 @@ impl Workspace {
             kkt,
             tangents,
             nudge: Nudge::new(model),
+            few_joints: model.few_joints(),
         }
     }
 

@@ -28,6 +28,9 @@ use crate::model::mechanism::{Model, Solver};
 /// Pivots of loops, relative to what they are compared with, from which on they are taken.
 const SAFE: f64 = 1e-6;
 
+/// What a factorization of the tree LU costs, in corrections.
+pub(crate) const TREE_CORRECTIONS: u32 = 3;
+
 /// The KKT system of a step, with all factors that its model may need.
 #[derive(Clone, Debug)]
 pub(crate) struct KktSystem {
@@ -146,7 +149,7 @@ impl KktSystem {
 
     /// What a factorization costs, in corrections.
     pub(crate) fn corrections(&self) -> u32 {
-        if self.has_recursion() { 2 } else { 3 }
+        if self.has_recursion() { 2 } else { TREE_CORRECTIONS }
     }
 
     pub(crate) fn has_recursion(&self) -> bool {

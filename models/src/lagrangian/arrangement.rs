@@ -2,12 +2,12 @@
 
 use std::fmt::Debug;
 use std::marker::PhantomData;
-use std::ops::Mul;
+use std::ops::{Deref, DerefMut, Mul};
 
 use plantd_math::scalar::{Compared, Lanes, LanesOf, Scalar, Side};
 
 use crate::lagrangian::plane::{Vec2, Vec3};
-use crate::model::planar_tree::{Body, PlanarJoints};
+use crate::model::planar_tree::{Body, PlanarJoint, PlanarJoints};
 
 /// How numbers of joints lie: those of several side by side, or one after the other.
 pub(crate) trait Arrangement: Clone + Debug {
@@ -18,6 +18,16 @@ pub(crate) trait Arrangement: Clone + Debug {
     const COUNT: usize;
     /// Whether each block goes through a whole pass by itself; else all go through a part of it together.
     const ALONE: bool;
+    /// A list of numbers of joints.
+    type List<T: Copy + Debug>: Clone + Debug + DerefMut<Target = [T]>;
+    /// A list of so many.
+    fn list<T: Copy + Debug>(number: T, count: usize) -> Self::List<T>;
+    /// What a joint of that index hangs on, and what on it.
+    #[inline(always)]
+    fn ties(joint: &PlanarJoint, _: usize) -> Ties {
+        let PlanarJoint { parent, is_followed, has_branches, anchor, .. } = *joint;
+        Ties { parent, is_followed, has_branches, is_anchor: anchor }
+    }
     /// What is fixed to the joints of a block.
     fn body(joints: &PlanarJoints, block: usize) -> &Body<Self::Constant>;
     fn one(several: &Self::Several, lane: usize) -> Self::Number;
@@ -37,6 +47,15 @@ pub(crate) trait Arrangement: Clone + Debug {
     fn collect(joints: &[[Self::Number; 4]]) -> [Self::Several; 4];
 }
 
+/// What a joint hangs on, and what on it; as in [`PlanarJoint`].
+#[derive(Clone, Copy)]
+pub(crate) struct Ties {
+    pub(crate) parent: usize,
+    pub(crate) is_followed: bool,
+    pub(crate) has_branches: bool,
+    pub(crate) is_anchor: bool,
+}
+
 /// Four joints side by side.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Fours;
@@ -45,8 +64,13 @@ impl Arrangement for Fours {
     type Number = f64;
     type Several = Lanes;
     type Constant = Lanes;
+    type List<T: Copy + Debug> = Vec<T>;
     const COUNT: usize = Lanes::COUNT;
     const ALONE: bool = false;
+
+    fn list<T: Copy + Debug>(number: T, count: usize) -> Vec<T> {
+        vec![number; count]
+    }
 
     #[inline(always)]
     fn body(joints: &PlanarJoints, block: usize) -> &Body<Lanes> {
@@ -119,8 +143,13 @@ impl<S: Scalar> Arrangement for Ones<S> {
     type Number = S;
     type Several = S;
     type Constant = f64;
+    type List<T: Copy + Debug> = Vec<T>;
     const COUNT: usize = 1;
     const ALONE: bool = true;
+
+    fn list<T: Copy + Debug>(number: T, count: usize) -> Vec<T> {
+        vec![number; count]
+    }
 
     #[inline(always)]
     fn body(joints: &PlanarJoints, block: usize) -> &Body {
@@ -156,6 +185,85 @@ impl<S: Scalar> Arrangement for Ones<S> {
 
     #[inline(always)]
     fn collect(joints: &[[S; 4]]) -> [S; 4] {
+        joints[0]
+    }
+}
+
+/// So many joints, each on the one before it and in the order of their coordinates: lists of known length, which may stay
+/// in registers.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct InARow<const N: usize>;
+
+/// A list of known length.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Known<T, const N: usize>([T; N]);
+
+impl<T, const N: usize> Deref for Known<T, N> {
+    type Target = [T];
+
+    #[inline(always)]
+    fn deref(&self) -> &[T] {
+        &self.0
+    }
+}
+
+impl<T, const N: usize> DerefMut for Known<T, N> {
+    #[inline(always)]
+    fn deref_mut(&mut self) -> &mut [T] {
+        &mut self.0
+    }
+}
+
+impl<const N: usize> Arrangement for InARow<N> {
+    type Number = f64;
+    type Several = f64;
+    type Constant = f64;
+    type List<T: Copy + Debug> = Known<T, N>;
+    const COUNT: usize = 1;
+    const ALONE: bool = true;
+
+    #[inline(always)]
+    fn list<T: Copy + Debug>(number: T, _: usize) -> Known<T, N> {
+        Known([number; N])
+    }
+
+    #[inline(always)]
+    fn ties(_: &PlanarJoint, joint: usize) -> Ties {
+        Ties { parent: joint, is_followed: joint + 1 < N, has_branches: false, is_anchor: false }
+    }
+
+    #[inline(always)]
+    fn body(joints: &PlanarJoints, block: usize) -> &Body {
+        &joints[block].body
+    }
+
+    #[inline(always)]
+    fn one(several: &f64, _: usize) -> f64 {
+        *several
+    }
+
+    #[inline(always)]
+    fn put(number: f64, several: &mut f64, _: usize) {
+        *several = number;
+    }
+
+    #[inline(always)]
+    fn gather(_: &PlanarJoints, block: usize, list: &[f64]) -> f64 {
+        list[block]
+    }
+
+    #[inline(always)]
+    fn scatter(_: &PlanarJoints, block: usize, several: f64, list: &mut [f64]) {
+        list[block] = several;
+    }
+
+    #[inline(always)]
+    fn spread(numbers: [f64; 4], joints: &mut [[f64; 4]]) {
+        joints[0] = numbers;
+    }
+
+    #[inline(always)]
+    fn collect(joints: &[[f64; 4]]) -> [f64; 4] {
         joints[0]
     }
 }

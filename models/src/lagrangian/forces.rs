@@ -17,7 +17,7 @@ use crate::lagrangian::instant::Instant;
 use crate::model::mechanism::{CoordinateInput, Forces, Mover, mover};
 
 /// Writes the input forces of a step; they do not change within it.
-#[inline(never)]
+#[inline(always)]
 pub(crate) fn input_forces<S: Scalar>(inputs: &[CoordinateInput], u: &[S], force: &mut [S]) {
     let (mut next, mut inputs) = (0, inputs.iter().peekable());
     // Most act on a coordinate of their own, one after the other: what is written is not read again.

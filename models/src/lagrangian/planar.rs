@@ -33,7 +33,7 @@ use std::ops::Range;
 use plantd_math::scalar::{Compared, LanesOf, Scalar, Truths, in_registers};
 use plantd_math::tree_lu::TreeLu;
 
-use crate::lagrangian::arrangement::{Arrangement, Fours, Ones, Planar, one2, one3, put2};
+use crate::lagrangian::arrangement::{Arrangement, Fours, InARow, Ones, Planar, one2, one3, put2};
 use crate::lagrangian::curvature::SecondDerivatives;
 use crate::lagrangian::plane::{
     Vec2, Vec3, add, add4, combined, cross, dot, linear, spun, times, turned,
@@ -129,6 +129,14 @@ impl<const N: usize> PlanarTree<LanesOf<N>> {
 }
 
 impl PlanarTree {
+    /// Takes over joints at a configuration and velocity, for second derivatives there.
+    #[inline(always)]
+    pub(crate) fn take<const N: usize>(&mut self, joints: &Joints<InARow<N>>) {
+        if let Self::Few(tree) = self {
+            tree.links.copy_from_slice(&joints.links);
+        }
+    }
+
     /// The joints of a tree of more than a few.
     pub(crate) fn many(&self) -> Option<&Joints<Fours>> {
         match self {
@@ -232,16 +240,16 @@ impl<S: Scalar> Below<S> {
 /// The joints of a planar tree at a configuration and velocity, block by block.
 #[derive(Clone, Debug)]
 pub(crate) struct Joints<A: Arrangement> {
-    links: Vec<Links<A::Several>>,
+    links: A::List<Links<A::Several>>,
     /// Momentum and first moment of mass, joint by joint, to the end of the last block.
-    sums: Vec<[A::Number; 4]>,
+    sums: A::List<[A::Number; 4]>,
     /// What changes above each joint make of its torque; used by [`PlanarTree::nudge`] alone.
-    from_above: Vec<A::Several>,
+    from_above: A::List<A::Several>,
     /// Sums over children that do not follow their parent in the list; zero but within a pass.
-    branches: Vec<Below<A::Number>>,
-    inertia_of_branches: Vec<A::Number>,
+    branches: A::List<Below<A::Number>>,
+    inertia_of_branches: A::List<A::Number>,
     /// Where the joints are, from the origin of the tree; set by [`Joints::place`].
-    positions: Vec<Vec2<A::Number>>,
+    positions: A::List<Vec2<A::Number>>,
 }
 
 /// A joint at a configuration and velocity.
@@ -258,20 +266,24 @@ pub(crate) struct Link<S> {
 /// The joints of a block.
 #[inline(always)]
 fn group<A: Arrangement>(joints: &[PlanarJoint], block: usize) -> &[PlanarJoint] {
+    if A::COUNT == 1 {
+        return std::slice::from_ref(&joints[block]);
+    }
     let rest = &joints[A::COUNT * block..];
     &rest[..A::COUNT.min(rest.len())]
 }
 
 impl<A: Arrangement> Joints<A> {
+    #[inline(always)]
     pub(crate) fn new(joints: &PlanarJoints) -> Self {
         let n = joints.len();
         Self {
-            links: vec![Links::default(); n.div_ceil(A::COUNT)],
-            sums: vec![[A::Number::ZERO; 4]; n.next_multiple_of(A::COUNT)],
-            from_above: vec![A::Several::ZERO; n.div_ceil(A::COUNT)],
-            branches: vec![Below::NONE; n],
-            inertia_of_branches: vec![A::Number::ZERO; n],
-            positions: vec![[A::Number::ZERO; 2]; n],
+            links: A::list(Links::default(), n.div_ceil(A::COUNT)),
+            sums: A::list([A::Number::ZERO; 4], n.next_multiple_of(A::COUNT)),
+            from_above: A::list(A::Several::ZERO, n.div_ceil(A::COUNT)),
+            branches: A::list(Below::NONE, n),
+            inertia_of_branches: A::list(A::Number::ZERO, n),
+            positions: A::list([A::Number::ZERO; 2], n),
         }
     }
 
@@ -286,52 +298,69 @@ impl<A: Arrangement> Joints<A> {
         l_v: &mut [A::Number],
     ) {
         in_registers!(A::Number, {
-            if joints.have_sliders {
-                self.walk::<true>(joints, q, velocity, l_q, l_v);
-            } else {
-                self.walk::<false>(joints, q, velocity, l_q, l_v);
-            }
+            self.gradient_here(joints, [q, velocity], [l_q, l_v]);
         })
+    }
+
+    /// The same in the code of the caller.
+    #[inline(always)]
+    pub(crate) fn gradient_here(
+        &mut self,
+        joints: &PlanarJoints,
+        [q, velocity]: [&[A::Number]; 2],
+        [l_q, l_v]: [&mut [A::Number]; 2],
+    ) {
+        if joints.have_sliders {
+            self.walk::<true>(joints, q, velocity, l_q, l_v);
+        } else {
+            self.walk::<false>(joints, q, velocity, l_q, l_v);
+        }
     }
 
     /// Computes `F` and `P` of each joint at the last gradient.
     #[inline(never)]
     pub(crate) fn differentiate(&mut self, joints: &PlanarJoints) {
-        in_registers!(A::Number, {
-            for link in &mut self.links {
-                link.moved = dot(link.edge, add(link.lever, times(link.moment, 2.0)));
-            }
-            let branches = &mut self.inertia_of_branches[..];
-            let mut below = A::Number::ZERO;
-            for (block, link) in self.links.iter_mut().enumerate().rev() {
-                let first = A::COUNT * block;
-                for (lane, joint) in group::<A>(joints, block).iter().enumerate().rev() {
-                    let mut sum = A::one(&link.inertia, lane);
-                    if joint.is_followed {
-                        sum += below;
-                    }
-                    if joint.has_branches {
-                        sum += std::mem::take(&mut branches[first + lane]);
-                    }
-                    A::put(sum, &mut link.total_inertia, lane);
-                    sum += A::one(&link.moved, lane);
-                    match joint.parent {
-                        0 => {}
-                        parent if parent == first + lane => below = sum,
-                        parent => branches[parent - 1] += sum,
-                    }
+        in_registers!(A::Number, { self.differentiate_here(joints) })
+    }
+
+    /// The same in the code of the caller.
+    #[inline(always)]
+    pub(crate) fn differentiate_here(&mut self, joints: &PlanarJoints) {
+        let links = &mut self.links[..];
+        for link in &mut *links {
+            link.moved = dot(link.edge, add(link.lever, times(link.moment, 2.0)));
+        }
+        let branches = &mut self.inertia_of_branches[..];
+        let mut below = A::Number::ZERO;
+        for (block, link) in links.iter_mut().enumerate().rev() {
+            let first = A::COUNT * block;
+            for (lane, joint) in group::<A>(joints, block).iter().enumerate().rev() {
+                let joint = A::ties(joint, first + lane);
+                let mut sum = A::one(&link.inertia, lane);
+                if joint.is_followed {
+                    sum += below;
+                }
+                if joint.has_branches {
+                    sum += std::mem::take(&mut branches[first + lane]);
+                }
+                A::put(sum, &mut link.total_inertia, lane);
+                sum += A::one(&link.moved, lane);
+                match joint.parent {
+                    0 => {}
+                    parent if parent == first + lane => below = sum,
+                    parent => branches[parent - 1] += sum,
                 }
             }
-            for (block, link) in self.links.iter_mut().enumerate() {
-                let Links { slide, rate, momentum, moment, total_inertia, .. } = *link;
-                let (body, f) = (A::body(joints, block), momentum);
-                let push = add(spun(moment, body.turn), times(slide, body.subtree_mass));
-                let pull = add(spun(f, body.turn), times(rate, body.subtree_mass));
-                link.force = [total_inertia * body.turn + cross(moment, slide), push[0], push[1]];
-                link.slope = [cross(slide, f) + cross(moment, rate), pull[0], pull[1]];
-                link.weight = cross(push, body.gravity);
-            }
-        })
+        }
+        for (block, link) in links.iter_mut().enumerate() {
+            let Links { slide, rate, momentum, moment, total_inertia, .. } = *link;
+            let (body, f) = (A::body(joints, block), momentum);
+            let push = add(spun(moment, body.turn), times(slide, body.subtree_mass));
+            let pull = add(spun(f, body.turn), times(rate, body.subtree_mass));
+            link.force = [total_inertia * body.turn + cross(moment, slide), push[0], push[1]];
+            link.slope = [cross(slide, f) + cross(moment, rate), pull[0], pull[1]];
+            link.weight = cross(push, body.gravity);
+        }
     }
 
     /// `SLIDES`: some joint is a slider.
@@ -418,6 +447,7 @@ impl<A: Arrangement> Joints<A> {
         for block in blocks {
             let first = A::COUNT * block;
             for (lane, joint) in group::<A>(joints, block).iter().enumerate() {
+                let joint = A::ties(joint, first + lane);
                 match joint.parent {
                     0 => Motion { direction, spin, .. } = Motion::NONE,
                     parent if parent == first + lane => {}
@@ -448,6 +478,7 @@ impl<A: Arrangement> Joints<A> {
         for block in blocks {
             let first = A::COUNT * block;
             for (lane, joint) in group::<A>(joints, block).iter().enumerate() {
+                let joint = A::ties(joint, first + lane);
                 match joint.parent {
                     0 => velocity = [A::Number::ZERO; 2],
                     parent if parent == first + lane => {}
@@ -478,12 +509,12 @@ impl<A: Arrangement> Joints<A> {
         let (links, sums) = (&mut links[..blocks.end], &mut sums[..A::COUNT * blocks.end]);
         let branches = &mut branches[..];
         for block in blocks.clone().rev() {
-            let (first, group, link) =
-                (A::COUNT * block, group::<A>(joints, block), &mut links[block]);
+            let (first, link) = (A::COUNT * block, &mut links[block]);
             // Of one joint in registers: what is written in parts waits before it is read as a whole.
             let mut single = [sums[first]];
             let own = if A::COUNT == 1 { &mut single[..] } else { &mut sums[first..][..A::COUNT] };
-            for (lane, joint) in group.iter().enumerate().rev() {
+            for (lane, joint) in group::<A>(joints, block).iter().enumerate().rev() {
+                let joint = A::ties(joint, first + lane);
                 let mut sum = own[lane];
                 if joint.is_followed {
                     sum = add4(sum, below.sums);
@@ -509,9 +540,9 @@ impl<A: Arrangement> Joints<A> {
             link.torque = cross(link.edge, [fx, fy]);
         }
         for block in blocks.clone().rev() {
-            let (first, group, link) =
-                (A::COUNT * block, group::<A>(joints, block), &mut links[block]);
-            for (lane, joint) in group.iter().enumerate().rev() {
+            let (first, link) = (A::COUNT * block, &mut links[block]);
+            for (lane, joint) in group::<A>(joints, block).iter().enumerate().rev() {
+                let joint = A::ties(joint, first + lane);
                 let mut sum = A::one(&link.turning, lane);
                 if joint.is_followed {
                     sum += below.turning;
@@ -545,23 +576,25 @@ impl<A: Arrangement> Joints<A> {
 
     /// Places the joints, for [`PlanarTree::pair`].
     #[inline(never)]
-    fn place(&mut self, joints: &[PlanarJoint]) {
+    fn place(&mut self, joints: &PlanarJoints) {
         if A::Number::IS_SEVERAL {
-            in_registers!(A::Number, { self.place_now(joints) })
+            in_registers!(A::Number, { self.place_here(joints) })
         } else {
-            self.place_now(joints);
+            self.place_here(joints);
         }
     }
 
+    /// The same in the code of the caller.
     #[inline(always)]
-    fn place_now(&mut self, joints: &[PlanarJoint]) {
-        for (i, joint) in joints.iter().enumerate() {
+    pub(crate) fn place_here(&mut self, joints: &PlanarJoints) {
+        for i in 0..self.positions.len() {
             // The root of a tree is its origin, unless that moves on.
+            let joint = A::ties(&joints[i], i);
             self.positions[i] = match joint.parent {
                 0 => [A::Number::ZERO; 2],
                 parent => add(self.positions[parent - 1], self.edge(i)),
             };
-            if joint.anchor {
+            if joint.is_anchor {
                 // All joints placed so far in its tree are its ancestors.
                 self.positions[i] = [A::Number::ZERO; 2];
                 let mut below = i;
@@ -626,27 +659,41 @@ impl<A: Arrangement> Joints<A> {
         matrix: &mut TreeLu<A::Number>,
     ) {
         if A::Number::IS_SEVERAL {
-            in_registers!(A::Number, { self.fill_now(joints, pairs, step, matrix) })
+            in_registers!(A::Number, { self.fill(joints, pairs, step, matrix) })
         } else {
-            self.fill_now(joints, pairs, step, matrix);
+            self.fill(joints, pairs, step, matrix);
         }
     }
 
     #[inline(always)]
-    fn fill_now(
+    fn fill(
         &self,
         joints: &[PlanarJoint],
         pairs: &[Pair],
         step: f64,
         matrix: &mut TreeLu<A::Number>,
     ) {
-        let (quarter, inverse) = (0.25 * step, 1.0 / step);
         for pair in pairs {
-            let second = self.pair(joints, pair.ancestor as usize, pair.descendant as usize);
-            let (common, slot) = (second.qq * quarter - second.vv * inverse, pair.slot as usize);
-            let skew = (second.q_above_v_below - second.v_above_q_below) * 0.5;
-            matrix.upper[slot] = common + skew;
-            matrix.lower[slot] = common - skew;
+            let [ancestor, descendant, slot] =
+                [pair.ancestor, pair.descendant, pair.slot].map(|i| i as usize);
+            self.fill_entry(joints, [ancestor, descendant], step, (matrix, slot));
         }
+    }
+
+    /// Fills the entries of a joint and one on its path to the root.
+    #[inline(always)]
+    pub(crate) fn fill_entry(
+        &self,
+        joints: &[PlanarJoint],
+        [ancestor, descendant]: [usize; 2],
+        step: f64,
+        (matrix, slot): (&mut TreeLu<A::Number>, usize),
+    ) {
+        let (quarter, inverse) = (0.25 * step, 1.0 / step);
+        let second = self.pair(joints, ancestor, descendant);
+        let common = second.qq * quarter - second.vv * inverse;
+        let skew = (second.q_above_v_below - second.v_above_q_below) * 0.5;
+        matrix.upper[slot] = common + skew;
+        matrix.lower[slot] = common - skew;
     }
 }

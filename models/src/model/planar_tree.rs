@@ -90,6 +90,14 @@ impl PlanarJoints {
     }
 }
 
+impl PlanarJoints {
+    /// Whether each joint hangs on the one before it, in the order of their coordinates, and the origin stays where it is.
+    pub(crate) fn are_in_a_row(&self) -> bool {
+        let mut joints = self.joints.iter().enumerate();
+        self.are_in_order && joints.all(|(i, joint)| joint.parent == i && !joint.anchor)
+    }
+}
+
 /// The bodies of a few joints, side by side.
 fn side_by_side(joints: &[PlanarJoint]) -> Body<Lanes> {
     let lanes = |number: &dyn Fn(&Body) -> f64| {

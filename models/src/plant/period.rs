@@ -149,6 +149,9 @@ impl PreciseState {
         workspace: &Workspace,
         collocation: Option<&Collocation>,
     ) {
+        if collocation.is_none() && self.move_few_on(model, workspace).is_some() {
+            return;
+        }
         let d = model.dimensions;
         let nd = d.dynamic;
         add(&mut self.q[..nd], &mut self.q_low, &workspace.step.increment);

@@ -21,9 +21,12 @@ impl Plant {
         if let Some(out) = &out {
             out.assert_model(&self.model);
         }
-        let PreciseState { halvings, calm, .. } = self.state;
-        let most = self.most_halvings();
-        let first = (halvings - u8::from(halvings > 0 && calm >= CALM)).min(most);
+        let first = match self.state {
+            PreciseState { halvings: 0, .. } => 0,
+            PreciseState { halvings, calm, .. } => {
+                (halvings - u8::from(calm >= CALM)).min(self.most_halvings())
+            }
+        };
         let mut failed = false;
         for halvings in first.. {
             let result = self.attempt(u, halvings, out.as_deref_mut());
@@ -39,7 +42,9 @@ impl Plant {
                     (report.halvings, report.steps) = (halvings.into(), report.steps.max(1));
                     return Ok(());
                 }
-                Err(error) if halvings >= most || !error.may_be_too_long() => return Err(error),
+                Err(error) if !error.may_be_too_long() || halvings >= self.most_halvings() => {
+                    return Err(error);
+                }
                 Err(_) => failed = true,
             }
         }

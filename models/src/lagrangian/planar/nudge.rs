@@ -40,10 +40,19 @@ impl<A: Arrangement> Joints<A> {
         velocity: &[A::Number],
         l_q: &mut [A::Number],
     ) {
-        in_registers!(A::Number, {
-            self.pass_on(joints, position, velocity);
-            self.sum_up(joints, position, velocity, l_q);
-        })
+        in_registers!(A::Number, { self.nudge_here(joints, [position, velocity], l_q) })
+    }
+
+    /// The same in the code of the caller.
+    #[inline(always)]
+    pub(crate) fn nudge_here(
+        &mut self,
+        joints: &PlanarJoints,
+        [position, velocity]: [&[A::Number]; 2],
+        l_q: &mut [A::Number],
+    ) {
+        self.pass_on(joints, position, velocity);
+        self.sum_up(joints, position, velocity, l_q);
     }
 
     /// From the roots to the leaves: what the parent's `Z` and `E` make of the torque of each joint.
@@ -51,7 +60,7 @@ impl<A: Arrangement> Joints<A> {
     fn pass_on(&mut self, joints: &PlanarJoints, position: &[A::Number], velocity: &[A::Number]) {
         let Self { links, from_above, sums, .. } = self;
         let mut last = [A::Number::ZERO; 4];
-        for (block, (link, from_above)) in links.iter().zip(from_above).enumerate() {
+        for (block, (link, from_above)) in links.iter().zip(&mut from_above[..]).enumerate() {
             let (first, body) = (A::COUNT * block, A::body(joints, block));
             let a = A::gather(joints, block, position);
             let b = A::gather(joints, block, velocity);
@@ -59,6 +68,7 @@ impl<A: Arrangement> Joints<A> {
             let own = [a * body.turn, b * body.turn, x, y];
             let mut above = [A::Several::ZERO; 4];
             for (lane, joint) in group::<A>(joints, block).iter().enumerate() {
+                let joint = A::ties(joint, first + lane);
                 match joint.parent {
                     0 => last = [A::Number::ZERO; 4],
                     parent if parent == first + lane => {}
@@ -88,13 +98,14 @@ impl<A: Arrangement> Joints<A> {
     ) {
         let Self { links, from_above, branches, .. } = self;
         let mut below = [A::Number::ZERO; 4];
-        for (block, (link, from_above)) in links.iter().zip(from_above).enumerate().rev() {
+        for (block, (link, from_above)) in links.iter().zip(&from_above[..]).enumerate().rev() {
             let (first, body) = (A::COUNT * block, A::body(joints, block));
             let a = A::gather(joints, block, position);
             let b = A::gather(joints, block, velocity);
             let ([_, fx, fy], [_, px, py]) = (link.force, link.slope);
             let mut all = [px * a + fx * b, py * a + fy * b, fx * a, fy * a];
             for (lane, joint) in group::<A>(joints, block).iter().enumerate().rev() {
+                let joint = A::ties(joint, first + lane);
                 let mut sum = all.each_ref().map(|own| A::one(own, lane));
                 if joint.is_followed {
                     sum = add4(sum, below);
