@@ -21,7 +21,7 @@ use crate::integrator::state::{PreciseState, add};
 use crate::integrator::workspace::{StepContext, StepIncrement, Workspace};
 use crate::kkt::system::{Factors, TREE_CORRECTIONS};
 use crate::lagrangian::arrangement::InARow;
-use crate::lagrangian::forces::input_forces;
+use crate::lagrangian::forces::input_forces_here;
 use crate::lagrangian::planar::Joints;
 use crate::model::mechanism::{Model, Solver};
 
@@ -103,7 +103,7 @@ impl Workspace {
             return None;
         }
         let mut input_force = [0.0; N];
-        input_forces(&model.coordinate_inputs, u, &mut input_force);
+        input_forces_here(&model.coordinate_inputs, u, &mut input_force);
         let [mut middles, mut velocity, mut angles] = [[0.0; N]; 3];
         let [mut l_q, mut l_v, mut force, mut r] = [[0.0; N]; 4];
 

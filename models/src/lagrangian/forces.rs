@@ -17,8 +17,14 @@ use crate::lagrangian::instant::Instant;
 use crate::model::mechanism::{CoordinateInput, Forces, Mover, mover};
 
 /// Writes the input forces of a step; they do not change within it.
-#[inline(always)]
+#[inline(never)]
 pub(crate) fn input_forces<S: Scalar>(inputs: &[CoordinateInput], u: &[S], force: &mut [S]) {
+    input_forces_here(inputs, u, force);
+}
+
+/// The same in the code of the caller.
+#[inline(always)]
+pub(crate) fn input_forces_here<S: Scalar>(inputs: &[CoordinateInput], u: &[S], force: &mut [S]) {
     let (mut next, mut inputs) = (0, inputs.iter().peekable());
     // Most act on a coordinate of their own, one after the other: what is written is not read again.
     while let Some(input) = inputs.next_if(|input| input.coordinate >= next) {
