@@ -24,6 +24,7 @@ use crate::lagrangian::arrangement::InARow;
 use crate::lagrangian::forces::input_forces_here;
 use crate::lagrangian::planar::Joints;
 use crate::model::mechanism::{Model, Solver};
+use crate::model::planar_tree::PlanarJoints;
 
 /// Joints for which there are such functions.
 const MOST: usize = 2;
@@ -36,12 +37,9 @@ impl Model {
             && self.orientations.is_empty()
             && !self.potentials.any
             && self.forces.is_none();
-        match &self.planar {
-            Some(joints) if is_bare && self.solver == Solver::Tree && joints.are_in_a_row() => {
-                if d.dynamic <= MOST { d.dynamic } else { 0 }
-            }
-            _ => 0,
-        }
+        let are_in_a_row = self.planar.as_ref().is_some_and(PlanarJoints::are_in_a_row);
+        let is_few = is_bare && are_in_a_row && self.solver == Solver::Tree && d.dynamic <= MOST;
+        if is_few { d.dynamic } else { 0 }
     }
 }
 
