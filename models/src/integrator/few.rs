@@ -65,7 +65,7 @@ impl PreciseState {
         let impulse = step.impulse.first_chunk::<N>()?;
         add(self.p.first_chunk_mut::<N>()?, self.p_low.first_chunk_mut::<N>()?, impulse);
         let inertia = model.conditioning.inertia.first_chunk::<N>()?;
-        self.past.record(increment, inertia, &[], step.report.iterations);
+        self.past.record_here(increment, inertia, &[], step.report.iterations);
         Some(())
     }
 }

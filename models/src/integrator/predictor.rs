@@ -229,8 +229,20 @@ impl Past {
 
     /// Takes note of a step. The error of all coordinates is weighed by their `inertia`; `pushed`, if it is not empty,
     /// is what was guessed of the change of the inputs.
-    #[inline(always)]
+    #[inline(never)]
     pub(crate) fn record(
+        &mut self,
+        increments: &[f64],
+        inertia: &[f64],
+        pushed: &[f64],
+        evaluations: u32,
+    ) {
+        self.record_here(increments, inertia, pushed, evaluations);
+    }
+
+    /// The same in the code of the caller.
+    #[inline(always)]
+    pub(crate) fn record_here(
         &mut self,
         increments: &[f64],
         inertia: &[f64],

@@ -87,6 +87,14 @@ name = "third"
 damping = 0.5
 "#;
 
+/// What makes a pendulum one of two joints that are not in a row.
+const ASIDE: &str = r#"
+[[frames]]
+name = "aside"
+joint = { type = "revolute", axis = [0.0, 1.0, 0.0] }
+body = { mass = 1.0, center_of_mass = [0.0, 0.0, -1.0] }
+"#;
+
 #[test]
 fn a_scene_runs_no_code_of_what_it_does_not_have() {
     let Some(valgrind) = valgrind() else { return };
@@ -103,6 +111,8 @@ fn a_scene_runs_no_code_of_what_it_does_not_have() {
         format!("{}/../models/scenes/elements/{name}.toml", env!("CARGO_MANIFEST_DIR"))
     };
     let [ball, drag, signals] = ["ball", "drag", "signals"].map(element);
+    let signals = std::fs::read_to_string(signals).expect("a scene");
+    let signals = write("signals.toml", &format!("{signals}{ASIDE}"));
     // Scene; has it constraints, springs, damping, inputs, forces, signals, ball joints?
     let (f, t) = (false, true);
     let cases = [
