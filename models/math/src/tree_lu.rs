@@ -47,8 +47,8 @@ impl<S: Compared> SmallestPivot<S> {
 /// What [`TreeLu::factor`] does.
 struct Factor<'a, S: Scalar> {
     matrix: &'a mut TreeLu<S>,
-    rows: usize,
     elimination: &'a SymbolicElimination,
+    /// One of each row.
     scale: &'a [f64],
     factor: f64,
 }
@@ -58,7 +58,8 @@ impl<S: Compared> Beside<S> for Factor<'_, S> {
 
     #[inline(always)]
     fn run<W: Wide<S>>(self) -> SmallestPivot<S> {
-        let Self { matrix, rows, elimination, scale, factor } = self;
+        let Self { matrix, elimination, scale, factor } = self;
+        let rows = scale.len();
         let TreeLu { upper, lower, inverse_pivot, reference, .. } = matrix;
         let offsets = &elimination.offsets[..=rows];
         let (inverse_pivot, reference) = (&mut inverse_pivot[..rows], &mut reference[..rows]);
@@ -138,8 +139,7 @@ impl<S: Compared> TreeLu<S> {
         scale: &[f64],
         factor: f64,
     ) -> SmallestPivot<S> {
-        let rows = elimination.rows();
-        S::beside(rows, Factor { matrix: self, rows, elimination, scale, factor })
+        S::beside(scale.len(), Factor { matrix: self, elimination, scale, factor })
     }
 
     /// Solves `K x = b` in place.
@@ -207,16 +207,15 @@ impl<const N: usize> TreeLu<LanesOf<N>> {
 }
 
 impl TreeLu {
-    /// [`Self::factor`] number by number, in the code of the caller; `rows` are all, where a compiler can know how many.
+    /// [`Self::factor`] number by number, in the code of the caller, which may know how many rows there are.
     #[inline(always)]
     pub fn factor_few(
         &mut self,
-        rows: usize,
         elimination: &SymbolicElimination,
         scale: &[f64],
         factor: f64,
     ) -> SmallestPivot {
-        alone(Factor { matrix: self, rows, elimination, scale, factor })
+        alone(Factor { matrix: self, elimination, scale, factor })
     }
 
     /// Solves `K X = B` in place for the first columns of a row-major matrix; `columns` and `stride`

@@ -11,17 +11,17 @@ use std::f64::consts::PI;
 
 use plantd_math::norms::largest_of_each;
 
-use crate::integrator::foresight::{Strayed, is_negligible};
+use crate::integrator::foresight::{Strayed, change_of, is_negligible};
 use crate::integrator::midpoint::middle;
 use crate::integrator::newton::{CONVERGED, Chord, STALE, is_round_off};
 use crate::integrator::report::StepReport;
-use crate::integrator::residual::sum_of;
+use crate::integrator::residual::{impulse_of, sum_of};
 use crate::integrator::settings::Settings;
 use crate::integrator::state::{PreciseState, add};
 use crate::integrator::workspace::{StepContext, StepIncrement, Workspace};
 use crate::kkt::system::{Factors, TREE_CORRECTIONS};
-use crate::lagrangian::arrangement::InARow;
-use crate::lagrangian::forces::input_forces_here;
+use crate::lagrangian::arrangement::{InARow, Ones};
+use crate::lagrangian::forces::{damped, input_forces_here};
 use crate::lagrangian::planar::Joints;
 use crate::model::mechanism::{Model, Solver};
 use crate::model::planar_tree::PlanarJoints;
@@ -88,7 +88,7 @@ impl Workspace {
         let (inverse, at_start) = (1.0 / h, force_split.at_start());
         let Self { step, mid, kkt, .. } = self;
         let joints = model.planar.as_ref()?;
-        let mut row = Joints::<InARow<N>>::new(joints);
+        let mut row = Joints::<Ones<f64, InARow<N>>>::new(joints);
         let [q, q_low] = [state.q.first_chunk::<N>()?, state.q_low.first_chunk()?];
         let [p, p_low] = [state.p.first_chunk::<N>()?, state.p_low.first_chunk()?];
         let inertia = model.conditioning.inertia.first_chunk::<N>()?;
@@ -117,7 +117,7 @@ impl Workspace {
             row.gradient_here(joints, [&angles, &velocity], [&mut l_q, &mut l_v]);
             let mut magnitudes = [0.0; N];
             for i in 0..N {
-                force[i] = input_force[i] - velocity[i] * damping[i];
+                force[i] = damped(input_force[i], velocity[i], damping[i]);
                 let terms = [l_q[i], l_v[i], force[i], angles[i]];
                 [r[i], magnitudes[i]] = sum_of([p[i], p_low[i]], terms, 0.5 * h, at_start * h);
             }
@@ -144,7 +144,7 @@ impl Workspace {
                 for (i, c) in damping.iter().enumerate() {
                     matrix.add_to_diagonal(model.elimination.offsets[i + 1] - 1, -at_start * c);
                 }
-                let pivot = matrix.factor_few(N, &model.elimination, inertia, 1.0 / h.abs());
+                let pivot = matrix.factor_few(&model.elimination, inertia, 1.0 / h.abs());
                 if !(pivot.relative >= settings.singular_below) {
                     return None;
                 }
@@ -177,12 +177,12 @@ impl Workspace {
         }
         let mut impulse = [0.0; N];
         for i in 0..N {
-            impulse[i] = (l_q[i] + force[i]) * h;
+            impulse[i] = impulse_of(l_q[i], force[i], h);
         }
         if !is_evaluated {
             let [mut position, mut rate, mut change] = [[0.0; N]; 3];
             for i in 0..N {
-                (position[i], rate[i]) = (r[i] * -0.5, -r[i] / h);
+                [position[i], rate[i]] = change_of(r[i], h);
             }
             row.nudge_here(joints, [&position, &rate], &mut change);
             for i in 0..N {

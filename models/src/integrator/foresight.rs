@@ -144,6 +144,12 @@ pub(crate) fn is_negligible<S: Compared>(left: S, expected: S) -> S::Truth {
     left.at_most(unseen) | (left.at_most(borne_out) & expected.at_most(little))
 }
 
+/// How a correction changes a coordinate at the midpoint, and its velocity.
+#[inline(always)]
+pub(crate) fn change_of<S: Compared>(x: S, h: f64) -> [S; 2] {
+    [x * -0.5, -x / h]
+}
+
 impl<S: Planar> Nudge<S> {
     /// Moves an impulse on by a correction, but for what ball joints make of it.
     #[inline(always)]
@@ -158,7 +164,7 @@ impl<S: Planar> Nudge<S> {
     ) {
         let changes = self.position.iter_mut().zip(&mut self.velocity);
         for ((position, velocity), x) in changes.zip(corrections) {
-            (*position, *velocity) = (*x * -0.5, -*x / h);
+            [*position, *velocity] = change_of(*x, h);
         }
         turn(&mut self.position);
         self.find(model, mechanics);

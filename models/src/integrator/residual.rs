@@ -19,7 +19,7 @@
 //! Ball joints weigh the terms by their maps: see [`balls`](crate::integrator::balls).
 
 use plantd_math::norms::largest;
-use plantd_math::scalar::{Compared, side_by_side};
+use plantd_math::scalar::{Compared, Scalar, side_by_side};
 use plantd_math::simd::wide;
 use plantd_math::spatial::{Vec3, three};
 
@@ -41,6 +41,12 @@ pub(crate) fn sum_of<S: Compared>(
     let (half_q, force) = (l_q * half, force * weight);
     let residual = ((p - l_v) + (half_q + force)) + p_low;
     [residual, p.abs() + l_v.abs() + half_q.abs() * (angle.abs() + 1.0) + force.abs()]
+}
+
+/// `D1Ld + D2Ld + F⁻ + F⁺ = h (L_q + f)` of a coordinate.
+#[inline(always)]
+pub(crate) fn impulse_of<S: Scalar>(l_q: S, force: S, h: f64) -> S {
+    (l_q + force) * h
 }
 
 impl Residual {
@@ -65,11 +71,11 @@ impl Residual {
 }
 
 impl<S: Planar> Midpoint<S> {
-    /// Writes `D1Ld + D2Ld + F⁻ + F⁺ = h (L_q + f)`.
+    /// Writes [`impulse_of`] all coordinates.
     pub(crate) fn write_impulse(&self, h: f64, impulse: &mut [S]) {
         let pairs = self.l_q.iter().zip(&self.force);
         for (impulse, (l_q, force)) in impulse.iter_mut().zip(pairs) {
-            *impulse = (*l_q + *force) * h;
+            *impulse = impulse_of(*l_q, *force, h);
         }
     }
 }

@@ -18,16 +18,8 @@ pub(crate) trait Arrangement: Clone + Debug {
     const COUNT: usize;
     /// Whether each block goes through a whole pass by itself; else all go through a part of it together.
     const ALONE: bool;
-    /// A list of numbers of joints.
-    type List<T: Copy + Debug>: Clone + Debug + DerefMut<Target = [T]>;
-    /// A list of so many.
-    fn list<T: Copy + Debug>(number: T, count: usize) -> Self::List<T>;
-    /// What a joint of that index hangs on, and what on it.
-    #[inline(always)]
-    fn ties(joint: &PlanarJoint, _: usize) -> Ties {
-        let PlanarJoint { parent, is_followed, has_branches, anchor, .. } = *joint;
-        Ties { parent, is_followed, has_branches, is_anchor: anchor }
-    }
+    /// What hangs on what.
+    type Order: Order;
     /// What is fixed to the joints of a block.
     fn body(joints: &PlanarJoints, block: usize) -> &Body<Self::Constant>;
     fn one(several: &Self::Several, lane: usize) -> Self::Number;
@@ -47,6 +39,21 @@ pub(crate) trait Arrangement: Clone + Debug {
     fn collect(joints: &[[Self::Number; 4]]) -> [Self::Several; 4];
 }
 
+/// What hangs on what, and the lists of numbers that go with it.
+pub(crate) trait Order: Clone + Debug {
+    /// A list of numbers of joints.
+    type List<T: Copy + Debug>: Clone + Debug + DerefMut<Target = [T]>;
+    /// A list of so many.
+    fn list<T: Copy + Debug>(number: T, count: usize) -> Self::List<T>;
+    /// What a joint of that index hangs on, and what on it.
+    fn ties(joint: &PlanarJoint, index: usize) -> Ties;
+    /// The coordinate of a joint of that index.
+    fn coordinate(joints: &PlanarJoints, index: usize) -> usize;
+}
+
+/// A list of numbers of joints.
+pub(crate) type List<A, T> = <<A as Arrangement>::Order as Order>::List<T>;
+
 /// What a joint hangs on, and what on it; as in [`PlanarJoint`].
 #[derive(Clone, Copy)]
 pub(crate) struct Ties {
@@ -54,6 +61,73 @@ pub(crate) struct Ties {
     pub(crate) is_followed: bool,
     pub(crate) has_branches: bool,
     pub(crate) is_anchor: bool,
+}
+
+/// Any trees.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct InTrees;
+
+impl Order for InTrees {
+    type List<T: Copy + Debug> = Vec<T>;
+
+    fn list<T: Copy + Debug>(number: T, count: usize) -> Vec<T> {
+        vec![number; count]
+    }
+
+    #[inline(always)]
+    fn ties(joint: &PlanarJoint, _: usize) -> Ties {
+        let PlanarJoint { parent, is_followed, has_branches, anchor, .. } = *joint;
+        Ties { parent, is_followed, has_branches, is_anchor: anchor }
+    }
+
+    #[inline(always)]
+    fn coordinate(joints: &PlanarJoints, index: usize) -> usize {
+        joints[index].coordinate
+    }
+}
+
+/// So many joints, each on the one before it and in the order of their coordinates ([`PlanarJoints::are_in_a_row`]): lists
+/// of known length, which may stay in registers.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct InARow<const N: usize>;
+
+impl<const N: usize> Order for InARow<N> {
+    type List<T: Copy + Debug> = Known<T, N>;
+
+    #[inline(always)]
+    fn list<T: Copy + Debug>(number: T, _: usize) -> Known<T, N> {
+        Known([number; N])
+    }
+
+    #[inline(always)]
+    fn ties(_: &PlanarJoint, index: usize) -> Ties {
+        Ties { parent: index, is_followed: index + 1 < N, has_branches: false, is_anchor: false }
+    }
+
+    #[inline(always)]
+    fn coordinate(_: &PlanarJoints, index: usize) -> usize {
+        index
+    }
+}
+
+/// A list of known length.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Known<T, const N: usize>([T; N]);
+
+impl<T, const N: usize> Deref for Known<T, N> {
+    type Target = [T];
+
+    #[inline(always)]
+    fn deref(&self) -> &[T] {
+        &self.0
+    }
+}
+
+impl<T, const N: usize> DerefMut for Known<T, N> {
+    #[inline(always)]
+    fn deref_mut(&mut self) -> &mut [T] {
+        &mut self.0
+    }
 }
 
 /// Four joints side by side.
@@ -64,13 +138,9 @@ impl Arrangement for Fours {
     type Number = f64;
     type Several = Lanes;
     type Constant = Lanes;
-    type List<T: Copy + Debug> = Vec<T>;
+    type Order = InTrees;
     const COUNT: usize = Lanes::COUNT;
     const ALONE: bool = false;
-
-    fn list<T: Copy + Debug>(number: T, count: usize) -> Vec<T> {
-        vec![number; count]
-    }
 
     #[inline(always)]
     fn body(joints: &PlanarJoints, block: usize) -> &Body<Lanes> {
@@ -137,19 +207,15 @@ impl Arrangement for Fours {
 
 /// One joint after the other.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Ones<S>(PhantomData<S>);
+pub(crate) struct Ones<S, O = InTrees>(PhantomData<(S, O)>);
 
-impl<S: Scalar> Arrangement for Ones<S> {
+impl<S: Scalar, O: Order> Arrangement for Ones<S, O> {
     type Number = S;
     type Several = S;
     type Constant = f64;
-    type List<T: Copy + Debug> = Vec<T>;
+    type Order = O;
     const COUNT: usize = 1;
     const ALONE: bool = true;
-
-    fn list<T: Copy + Debug>(number: T, count: usize) -> Vec<T> {
-        vec![number; count]
-    }
 
     #[inline(always)]
     fn body(joints: &PlanarJoints, block: usize) -> &Body {
@@ -168,12 +234,12 @@ impl<S: Scalar> Arrangement for Ones<S> {
 
     #[inline(always)]
     fn gather(joints: &PlanarJoints, block: usize, list: &[S]) -> S {
-        list[joints[block].coordinate]
+        list[O::coordinate(joints, block)]
     }
 
     #[inline(always)]
     fn scatter(joints: &PlanarJoints, block: usize, several: S, list: &mut [S]) {
-        if let Some(entry) = list.get_mut(joints[block].coordinate) {
+        if let Some(entry) = list.get_mut(O::coordinate(joints, block)) {
             *entry = several;
         }
     }
@@ -185,85 +251,6 @@ impl<S: Scalar> Arrangement for Ones<S> {
 
     #[inline(always)]
     fn collect(joints: &[[S; 4]]) -> [S; 4] {
-        joints[0]
-    }
-}
-
-/// So many joints, each on the one before it and in the order of their coordinates: lists of known length, which may stay
-/// in registers.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct InARow<const N: usize>;
-
-/// A list of known length.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Known<T, const N: usize>([T; N]);
-
-impl<T, const N: usize> Deref for Known<T, N> {
-    type Target = [T];
-
-    #[inline(always)]
-    fn deref(&self) -> &[T] {
-        &self.0
-    }
-}
-
-impl<T, const N: usize> DerefMut for Known<T, N> {
-    #[inline(always)]
-    fn deref_mut(&mut self) -> &mut [T] {
-        &mut self.0
-    }
-}
-
-impl<const N: usize> Arrangement for InARow<N> {
-    type Number = f64;
-    type Several = f64;
-    type Constant = f64;
-    type List<T: Copy + Debug> = Known<T, N>;
-    const COUNT: usize = 1;
-    const ALONE: bool = true;
-
-    #[inline(always)]
-    fn list<T: Copy + Debug>(number: T, _: usize) -> Known<T, N> {
-        Known([number; N])
-    }
-
-    #[inline(always)]
-    fn ties(_: &PlanarJoint, joint: usize) -> Ties {
-        Ties { parent: joint, is_followed: joint + 1 < N, has_branches: false, is_anchor: false }
-    }
-
-    #[inline(always)]
-    fn body(joints: &PlanarJoints, block: usize) -> &Body {
-        &joints[block].body
-    }
-
-    #[inline(always)]
-    fn one(several: &f64, _: usize) -> f64 {
-        *several
-    }
-
-    #[inline(always)]
-    fn put(number: f64, several: &mut f64, _: usize) {
-        *several = number;
-    }
-
-    #[inline(always)]
-    fn gather(_: &PlanarJoints, block: usize, list: &[f64]) -> f64 {
-        list[block]
-    }
-
-    #[inline(always)]
-    fn scatter(_: &PlanarJoints, block: usize, several: f64, list: &mut [f64]) {
-        list[block] = several;
-    }
-
-    #[inline(always)]
-    fn spread(numbers: [f64; 4], joints: &mut [[f64; 4]]) {
-        joints[0] = numbers;
-    }
-
-    #[inline(always)]
-    fn collect(joints: &[[f64; 4]]) -> [f64; 4] {
         joints[0]
     }
 }

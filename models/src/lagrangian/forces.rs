@@ -38,6 +38,12 @@ pub(crate) fn input_forces_here<S: Scalar>(inputs: &[CoordinateInput], u: &[S], 
     }
 }
 
+/// `input − c v` of a coordinate.
+#[inline(always)]
+pub(crate) fn damped<S: Scalar>(input: S, v: S, c: f64) -> S {
+    input - v * c
+}
+
 /// Writes `total = input − C v`.
 #[inline(never)]
 pub(crate) fn add_damping<S: Scalar>(
@@ -47,7 +53,7 @@ pub(crate) fn add_damping<S: Scalar>(
     total: &mut [S],
 ) {
     for (((total, input), c), v) in total.iter_mut().zip(input).zip(damping).zip(velocity) {
-        *total = *input - *v * *c;
+        *total = damped(*input, *v, *c);
     }
 }
 

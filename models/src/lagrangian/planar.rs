@@ -33,7 +33,9 @@ use std::ops::Range;
 use plantd_math::scalar::{Compared, LanesOf, Scalar, Truths, in_registers};
 use plantd_math::tree_lu::TreeLu;
 
-use crate::lagrangian::arrangement::{Arrangement, Fours, InARow, Ones, Planar, one2, one3, put2};
+use crate::lagrangian::arrangement::{
+    Arrangement, Fours, InARow, List, Ones, Order, Planar, one2, one3, put2,
+};
 use crate::lagrangian::curvature::SecondDerivatives;
 use crate::lagrangian::plane::{
     Vec2, Vec3, add, add4, combined, cross, dot, linear, spun, times, turned,
@@ -131,7 +133,7 @@ impl<const N: usize> PlanarTree<LanesOf<N>> {
 impl PlanarTree {
     /// Takes over joints at a configuration and velocity, for second derivatives there.
     #[inline(always)]
-    pub(crate) fn take<const N: usize>(&mut self, joints: &Joints<InARow<N>>) {
+    pub(crate) fn take<const N: usize>(&mut self, joints: &Joints<Ones<f64, InARow<N>>>) {
         if let Self::Few(tree) = self {
             tree.links.copy_from_slice(&joints.links);
         }
@@ -240,16 +242,16 @@ impl<S: Scalar> Below<S> {
 /// The joints of a planar tree at a configuration and velocity, block by block.
 #[derive(Clone, Debug)]
 pub(crate) struct Joints<A: Arrangement> {
-    links: A::List<Links<A::Several>>,
+    links: List<A, Links<A::Several>>,
     /// Momentum and first moment of mass, joint by joint, to the end of the last block.
-    sums: A::List<[A::Number; 4]>,
+    sums: List<A, [A::Number; 4]>,
     /// What changes above each joint make of its torque; used by [`PlanarTree::nudge`] alone.
-    from_above: A::List<A::Several>,
+    from_above: List<A, A::Several>,
     /// Sums over children that do not follow their parent in the list; zero but within a pass.
-    branches: A::List<Below<A::Number>>,
-    inertia_of_branches: A::List<A::Number>,
+    branches: List<A, Below<A::Number>>,
+    inertia_of_branches: List<A, A::Number>,
     /// Where the joints are, from the origin of the tree; set by [`Joints::place`].
-    positions: A::List<Vec2<A::Number>>,
+    positions: List<A, Vec2<A::Number>>,
 }
 
 /// A joint at a configuration and velocity.
@@ -278,12 +280,12 @@ impl<A: Arrangement> Joints<A> {
     pub(crate) fn new(joints: &PlanarJoints) -> Self {
         let n = joints.len();
         Self {
-            links: A::list(Links::default(), n.div_ceil(A::COUNT)),
-            sums: A::list([A::Number::ZERO; 4], n.next_multiple_of(A::COUNT)),
-            from_above: A::list(A::Several::ZERO, n.div_ceil(A::COUNT)),
-            branches: A::list(Below::NONE, n),
-            inertia_of_branches: A::list(A::Number::ZERO, n),
-            positions: A::list([A::Number::ZERO; 2], n),
+            links: A::Order::list(Links::default(), n.div_ceil(A::COUNT)),
+            sums: A::Order::list([A::Number::ZERO; 4], n.next_multiple_of(A::COUNT)),
+            from_above: A::Order::list(A::Several::ZERO, n.div_ceil(A::COUNT)),
+            branches: A::Order::list(Below::NONE, n),
+            inertia_of_branches: A::Order::list(A::Number::ZERO, n),
+            positions: A::Order::list([A::Number::ZERO; 2], n),
         }
     }
 
@@ -335,7 +337,7 @@ impl<A: Arrangement> Joints<A> {
         for (block, link) in links.iter_mut().enumerate().rev() {
             let first = A::COUNT * block;
             for (lane, joint) in group::<A>(joints, block).iter().enumerate().rev() {
-                let joint = A::ties(joint, first + lane);
+                let joint = A::Order::ties(joint, first + lane);
                 let mut sum = A::one(&link.inertia, lane);
                 if joint.is_followed {
                     sum += below;
@@ -447,7 +449,7 @@ impl<A: Arrangement> Joints<A> {
         for block in blocks {
             let first = A::COUNT * block;
             for (lane, joint) in group::<A>(joints, block).iter().enumerate() {
-                let joint = A::ties(joint, first + lane);
+                let joint = A::Order::ties(joint, first + lane);
                 match joint.parent {
                     0 => Motion { direction, spin, .. } = Motion::NONE,
                     parent if parent == first + lane => {}
@@ -478,7 +480,7 @@ impl<A: Arrangement> Joints<A> {
         for block in blocks {
             let first = A::COUNT * block;
             for (lane, joint) in group::<A>(joints, block).iter().enumerate() {
-                let joint = A::ties(joint, first + lane);
+                let joint = A::Order::ties(joint, first + lane);
                 match joint.parent {
                     0 => velocity = [A::Number::ZERO; 2],
                     parent if parent == first + lane => {}
@@ -514,7 +516,7 @@ impl<A: Arrangement> Joints<A> {
             let mut single = [sums[first]];
             let own = if A::COUNT == 1 { &mut single[..] } else { &mut sums[first..][..A::COUNT] };
             for (lane, joint) in group::<A>(joints, block).iter().enumerate().rev() {
-                let joint = A::ties(joint, first + lane);
+                let joint = A::Order::ties(joint, first + lane);
                 let mut sum = own[lane];
                 if joint.is_followed {
                     sum = add4(sum, below.sums);
@@ -542,7 +544,7 @@ impl<A: Arrangement> Joints<A> {
         for block in blocks.clone().rev() {
             let (first, link) = (A::COUNT * block, &mut links[block]);
             for (lane, joint) in group::<A>(joints, block).iter().enumerate().rev() {
-                let joint = A::ties(joint, first + lane);
+                let joint = A::Order::ties(joint, first + lane);
                 let mut sum = A::one(&link.turning, lane);
                 if joint.is_followed {
                     sum += below.turning;
@@ -589,7 +591,7 @@ impl<A: Arrangement> Joints<A> {
     pub(crate) fn place_here(&mut self, joints: &PlanarJoints) {
         for i in 0..self.positions.len() {
             // The root of a tree is its origin, unless that moves on.
-            let joint = A::ties(&joints[i], i);
+            let joint = A::Order::ties(&joints[i], i);
             self.positions[i] = match joint.parent {
                 0 => [A::Number::ZERO; 2],
                 parent => add(self.positions[parent - 1], self.edge(i)),

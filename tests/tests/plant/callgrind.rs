@@ -66,33 +66,19 @@ stiffness = 3.0
 rest_length = 0.5
 "#;
 
-/// What makes it three rods in a row, of which the last joint is damped; steps of one and of two are one function each.
-const MORE_RODS: &str = r#"
-[[frames]]
-name = "second"
-parent = "rod"
-translation = [0.0, 0.0, -1.0]
-joint = { type = "revolute", axis = [0.0, 1.0, 0.0] }
-body = { mass = 1.0, center_of_mass = [0.0, 0.0, -1.0] }
-
-[[frames]]
-name = "third"
-parent = "second"
-translation = [0.0, 0.0, -1.0]
-joint = { type = "revolute", axis = [0.0, 1.0, 0.0] }
-body = { mass = 1.0, center_of_mass = [0.0, 0.0, -1.0] }
-
-[[coordinates]]
-name = "third"
-damping = 0.5
-"#;
-
-/// What makes a pendulum one of two joints that are not in a row.
+/// Another joint, on no other: steps of one joint, and of two in a row, are one function each, in which no stage has a name.
 const ASIDE: &str = r#"
 [[frames]]
 name = "aside"
 joint = { type = "revolute", axis = [0.0, 1.0, 0.0] }
 body = { mass = 1.0, center_of_mass = [0.0, 0.0, -1.0] }
+"#;
+
+/// What damps it.
+const DAMPED: &str = r#"
+[[coordinates]]
+name = "aside"
+damping = 0.5
 "#;
 
 #[test]
@@ -106,7 +92,7 @@ fn a_scene_runs_no_code_of_what_it_does_not_have() {
     };
     let bare = write("bare.toml", BARE);
     let sprung = write("sprung.toml", &format!("{BARE}{SPRINGS_OF_SPRUNG}"));
-    let damped = write("damped.toml", &format!("{BARE}{MORE_RODS}"));
+    let damped = write("damped.toml", &format!("{BARE}{ASIDE}{DAMPED}"));
     let element = |name: &str| {
         format!("{}/../models/scenes/elements/{name}.toml", env!("CARGO_MANIFEST_DIR"))
     };

@@ -8,7 +8,7 @@
 
 use plantd_math::scalar::{Scalar, in_registers};
 
-use crate::lagrangian::arrangement::{Arrangement, Planar, one2};
+use crate::lagrangian::arrangement::{Arrangement, Order, Planar, one2};
 use crate::lagrangian::planar::{Below, Joints, PlanarTree, group};
 use crate::lagrangian::plane::{add, add4, cross, dot, spun, times};
 use crate::model::planar_tree::PlanarJoints;
@@ -68,7 +68,7 @@ impl<A: Arrangement> Joints<A> {
             let own = [a * body.turn, b * body.turn, x, y];
             let mut above = [A::Several::ZERO; 4];
             for (lane, joint) in group::<A>(joints, block).iter().enumerate() {
-                let joint = A::ties(joint, first + lane);
+                let joint = A::Order::ties(joint, first + lane);
                 match joint.parent {
                     0 => last = [A::Number::ZERO; 4],
                     parent if parent == first + lane => {}
@@ -105,7 +105,7 @@ impl<A: Arrangement> Joints<A> {
             let ([_, fx, fy], [_, px, py]) = (link.force, link.slope);
             let mut all = [px * a + fx * b, py * a + fy * b, fx * a, fy * a];
             for (lane, joint) in group::<A>(joints, block).iter().enumerate().rev() {
-                let joint = A::ties(joint, first + lane);
+                let joint = A::Order::ties(joint, first + lane);
                 let mut sum = all.each_ref().map(|own| A::one(own, lane));
                 if joint.is_followed {
                     sum = add4(sum, below);
