@@ -219,7 +219,8 @@ async fn without_a_valid_input_the_policy_acts_and_the_next_input_ends_it() {
     let (_server, client) = server().await;
     let id = plant(&client, "cart-pole").await.id;
     let policy = v1::InputPolicy {
-        timeout_s: 0.05,
+        // On the plant's clock: 50 ms of the machine's, within which it has to run the plant, the server and the driver.
+        timeout_s: 0.5,
         action: v1::InputAction::Safe.into(),
         safe: vec![-3.0],
         ..Default::default()
