@@ -10,11 +10,11 @@ use std::ops::{Add, AddAssign, BitAnd, BitOr, Div, Mul, Neg, Not, Sub, SubAssign
 
 use crate::eights::Eight;
 use crate::rows::{Block, sum_of_eight};
-use crate::simd::{in_avx512, wide};
+use crate::simd::{AVX512, has, in_avx512, wide};
 use crate::trigonometry;
 
-pub use beside::{Beside, Wide, alone};
-use beside::{in_plants, in_sides};
+pub use beside::{Beside, Wide};
+use beside::{in_one, in_plants, in_sides};
 
 /// Operators of a type: by what they make of one or two operands, and of what they put in its place.
 macro_rules! operators {
@@ -56,6 +56,10 @@ pub(crate) use operators;
 /// What [`Scalar`] says of numbers side by side, of a type that has none.
 macro_rules! nothing_beside {
     () => {
+        #[inline(always)]
+        fn alone<T: $crate::scalar::Beside<Self>>(task: T) -> T::Output {
+            task.run::<Self>()
+        }
         type Several = Self;
         type Row = [Self; 8];
         const BESIDE: usize = 1;
@@ -166,6 +170,8 @@ pub trait Scalar:
     fn dot_of_six(a: &Self::Row, b: &Self::Row) -> Self;
     /// Does what is done with numbers side by side, so many of which are in a list.
     fn beside<T: Beside<Self>>(count: usize, task: T) -> T::Output;
+    /// The same for one number, in the code of the caller.
+    fn alone<T: Beside<Self>>(task: T) -> T::Output;
     /// `(sin x, cos x)`.
     fn sin_cos(self) -> (Self, Self);
     /// Writes `sin x` and `cos x` of each.
@@ -222,6 +228,10 @@ impl Scalar for f64 {
     #[inline(always)]
     fn beside<T: Beside<Self>>(count: usize, task: T) -> T::Output {
         in_sides(count, task)
+    }
+    #[inline(always)]
+    fn alone<T: Beside<Self>>(task: T) -> T::Output {
+        in_one(task)
     }
     const ZERO: Self = 0.0;
     const ONE: Self = 1.0;
@@ -393,6 +403,21 @@ impl<const N: usize> LanesOf<N> {
         }
     }
 
+    /// The largest of the numbers.
+    #[inline(always)]
+    pub fn largest(self) -> f64 {
+        const { assert!(N.is_power_of_two()) };
+        let (mut lanes, mut half) = (self.0, N);
+        while half > 1 {
+            half /= 2;
+            for lane in 0..half {
+                let other = lanes[lane + half];
+                lanes[lane] = if other > lanes[lane] { other } else { lanes[lane] };
+            }
+        }
+        lanes[0]
+    }
+
     #[inline(always)]
     fn each(mut self, f: impl Fn(f64) -> f64) -> Self {
         for x in &mut self.0 {
@@ -434,7 +459,7 @@ impl<const N: usize> Scalar for LanesOf<N> {
     }
     #[inline(always)]
     fn in_registers<R>(block: impl FnOnce() -> R) -> R {
-        if const { N > Lanes::COUNT } { in_avx512(block) } else { wide!({ block() }) }
+        if N > Lanes::COUNT && has(AVX512) { in_avx512(block) } else { wide!({ block() }) }
     }
     /// Of the first: nothing that branches on it may run on several numbers.
     #[inline(always)]

@@ -3,7 +3,7 @@
 
 use crate::elimination::SymbolicElimination;
 use crate::rows::{LANES, Term, add_rows_portable, padded};
-use crate::scalar::{Beside, Compared, LanesOf, Scalar, Wide, alone};
+use crate::scalar::{Beside, Compared, LanesOf, Scalar, Wide};
 use crate::simd::widest;
 
 /// A matrix that couples each row only with its ancestors, and its factorization in place.
@@ -142,6 +142,17 @@ impl<S: Compared> TreeLu<S> {
         S::beside(scale.len(), Factor { matrix: self, elimination, scale, factor })
     }
 
+    /// [`Self::factor`] number by number, in the code of the caller, which may know how many rows there are.
+    #[inline(always)]
+    pub fn factor_few(
+        &mut self,
+        elimination: &SymbolicElimination,
+        scale: &[f64],
+        factor: f64,
+    ) -> SmallestPivot<S> {
+        S::alone(Factor { matrix: self, elimination, scale, factor })
+    }
+
     /// Solves `K x = b` in place.
     #[inline(never)]
     pub fn solve(&self, elimination: &SymbolicElimination, x: &mut [S]) {
@@ -207,17 +218,6 @@ impl<const N: usize> TreeLu<LanesOf<N>> {
 }
 
 impl TreeLu {
-    /// [`Self::factor`] number by number, in the code of the caller, which may know how many rows there are.
-    #[inline(always)]
-    pub fn factor_few(
-        &mut self,
-        elimination: &SymbolicElimination,
-        scale: &[f64],
-        factor: f64,
-    ) -> SmallestPivot {
-        alone(Factor { matrix: self, elimination, scale, factor })
-    }
-
     /// Solves `K X = B` in place for the first columns of a row-major matrix; `columns` and `stride`
     /// are whole blocks.
     pub fn solve_rows(

@@ -4,7 +4,10 @@
 //! one by one: what one of them has reached is put aside, and the others go on. All formulas are those of the
 //! other loop, on other numbers. It knows the usual way of a step alone: from a guess by past increments to
 //! convergence. A lane that leaves it is not solved here, and has its step taken by the other loop. What it gains
-//! is in `docs/figures.md`; tests hold each lane to the bits of the other loop.
+//! is in `docs/figures.md`; tests hold each lane to the bits of the other loop. Of one joint, or of two in a row, lanes
+//! have a loop of their own ([`row`]).
+
+mod row;
 
 use std::f64::consts::PI;
 
@@ -26,6 +29,7 @@ use crate::integrator::state::{PreciseState, add};
 use crate::kkt::planar::Elimination;
 use crate::kkt::system::Factors;
 use crate::lagrangian::arrangement::Planar;
+use crate::lagrangian::forces::input_forces;
 use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::mechanics::Kept;
 use crate::lagrangian::nudge::Nudge;
@@ -49,6 +53,8 @@ pub(crate) struct Abreast<const N: usize> {
     diagonal: Vec<LanesOf<N>>,
     nudge: Nudge<LanesOf<N>>,
     push: Option<Push<N>>,
+    /// Joints, where steps are [those of a few](super::few), else zero.
+    few_joints: usize,
 }
 
 /// States side by side.
@@ -331,13 +337,21 @@ impl<const N: usize> Abreast<N> {
             diagonal: zeros(),
             nudge: Nudge::new(model),
             push: pushes.then(|| Push { pushed: zeros(), points: Points::new(nd) }),
+            few_joints: model.few_joints(),
         }
     }
 
-    /// Sets the inputs of a lane.
+    /// Sets the inputs, those of one plant after those of the other, `width` of each; in which lanes they are finite.
     #[inline(always)]
-    pub(crate) fn set_inputs(&mut self, lane: usize, u: &[f64]) {
-        load(lane, &mut self.mid.inputs, u);
+    pub(crate) fn set_inputs(&mut self, inputs: &[f64], width: usize) -> Truths<N> {
+        let mut are_finite = LanesOf::<N>::all(true);
+        for (k, lanes) in self.mid.inputs.iter_mut().enumerate() {
+            for (lane, u) in lanes.0.iter_mut().zip(inputs[k..].iter().step_by(width)) {
+                *lane = *u;
+            }
+            are_finite = are_finite & lanes.abs().less(LanesOf::constant(f64::INFINITY));
+        }
+        are_finite
     }
 
     /// Solves a step of the lanes that are said; those that are solved are returned, and their results
@@ -351,9 +365,14 @@ impl<const N: usize> Abreast<N> {
         lanes: Truths<N>,
         results: &mut [Result<StepReport, StepError>],
     ) -> Truths<N> {
+        match self.few_joints {
+            1 => return self.solve_joints::<1>(model, settings, state, lanes, results),
+            2 => return self.solve_joints::<2>(model, settings, state, lanes, results),
+            _ => {}
+        }
         in_registers!(LanesOf<N>, {
             let Midpoint { inputs, input_force, force, .. } = &mut self.mid;
-            crate::lagrangian::forces::input_forces(&model.coordinate_inputs, inputs, input_force);
+            input_forces(&model.coordinate_inputs, inputs, input_force);
             force.copy_from_slice(input_force);
             self.predict(state);
             let mut lanes = lanes;
@@ -368,7 +387,7 @@ impl<const N: usize> Abreast<N> {
     #[inline(always)]
     fn predict(&mut self, state: &States<N>) {
         let States { past, order, .. } = state;
-        let most = order.0.into_iter().fold(1.0, f64::max) as usize;
+        let most = order.largest() as usize;
         for (increment, differences) in self.increment.iter_mut().zip(past) {
             let mut sum = differences[0];
             for (m, difference) in differences.iter().enumerate().take(most).skip(1) {
@@ -543,12 +562,8 @@ impl<const N: usize> Abreast<N> {
                         iterations,
                         factorizations: factorizations.0[lane] as u32,
                         residual: residual.0[lane],
-                        constraint_residual: 0.0,
                         reciprocal_condition: pivots.0[lane],
-                        constraint_reciprocal_condition: 1.0,
-                        redundant_constraints: 0,
-                        steps: 1,
-                        halvings: 0,
+                        ..StepReport::UNCONSTRAINED
                     });
                 }
             };
@@ -607,19 +622,26 @@ impl<const N: usize> Abreast<N> {
     /// Moves all lanes on to what they have come to.
     #[inline(never)]
     pub(crate) fn move_on(&mut self, model: &Model, state: &mut States<N>) {
-        in_registers!(LanesOf<N>, {
-            let Self { solved: [increment, impulse], evaluations, push, systems, .. } = self;
-            let States { q, q_low, p, p_low, past, known, order, last } = state;
-            add(q, q_low, increment);
-            add(p, p_low, impulse);
-            let inertia = &model.conditioning.inertia[..];
-            let pushed = push.as_ref().map_or(&[][..], |push| &push.pushed);
-            let counts = [*known, *evaluations];
-            [*known, *order] = take_note(past, increment, inertia, pushed, counts);
-            if let (Some(push), Some(last)) = (push, last) {
-                std::mem::swap(&mut last.points, &mut push.points);
-                std::mem::swap(&mut last.factors, &mut systems.first);
-            }
-        })
+        match self.few_joints {
+            1 => in_registers!(LanesOf<N>, { self.move_joints_on::<1>(model, state) }),
+            2 => in_registers!(LanesOf<N>, { self.move_joints_on::<2>(model, state) }),
+            _ => in_registers!(LanesOf<N>, { self.move_all_on(model, state) }),
+        }
+    }
+
+    #[inline(always)]
+    fn move_all_on(&mut self, model: &Model, state: &mut States<N>) {
+        let Self { solved: [increment, impulse], evaluations, push, systems, .. } = self;
+        let States { q, q_low, p, p_low, past, known, order, last } = state;
+        add(q, q_low, increment);
+        add(p, p_low, impulse);
+        let inertia = &model.conditioning.inertia[..];
+        let pushed = push.as_ref().map_or(&[][..], |push| &push.pushed);
+        let counts = [*known, *evaluations];
+        [*known, *order] = take_note(past, increment, inertia, pushed, counts);
+        if let (Some(push), Some(last)) = (push, last) {
+            std::mem::swap(&mut last.points, &mut push.points);
+            std::mem::swap(&mut last.factors, &mut systems.first);
+        }
     }
 }

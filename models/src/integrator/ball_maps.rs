@@ -2,7 +2,7 @@
 
 use plantd_math::rotation::{Chart, Quaternion, Turn};
 use plantd_math::rows::Block;
-use plantd_math::scalar::{Beside, Scalar, Wide, alone};
+use plantd_math::scalar::{Beside, Scalar, Wide};
 use plantd_math::sided::{Composite, Sided};
 use plantd_math::spatial::{Mat3, Vec3};
 
@@ -13,7 +13,7 @@ const BESIDE: usize = <f64 as Scalar>::BESIDE;
 
 /// Does it for all of so many ball joints. A floating base has one: side by side with nothing it would take longer.
 pub(crate) fn beside<T: Beside<f64>>(count: usize, task: T) -> T::Output {
-    if count == 1 { alone(task) } else { f64::beside(count, task) }
+    if count == 1 { f64::alone(task) } else { f64::beside(count, task) }
 }
 
 /// In registers.

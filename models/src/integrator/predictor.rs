@@ -108,7 +108,7 @@ fn best_order<S: Compared>(errors: &[S; LENGTH], seen: S, count: usize) -> S {
 }
 
 #[inline(always)]
-fn least<S: Compared>(a: S, b: S) -> S {
+pub(crate) fn least<S: Compared>(a: S, b: S) -> S {
     S::choose(a.less(b), a, b)
 }
 

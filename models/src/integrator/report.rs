@@ -162,6 +162,19 @@ impl Estimates {
 }
 
 impl StepReport {
+    /// Of one step, of a model without constraints.
+    pub(crate) const UNCONSTRAINED: Self = Self {
+        iterations: 0,
+        factorizations: 0,
+        residual: 0.0,
+        constraint_residual: 0.0,
+        reciprocal_condition: 1.0,
+        constraint_reciprocal_condition: 1.0,
+        redundant_constraints: 0,
+        steps: 1,
+        halvings: 0,
+    };
+
     /// Adds a step of a period.
     pub(crate) fn add(&mut self, step: &Self) {
         self.iterations += step.iterations;

@@ -81,10 +81,12 @@ struct Mechanics<'a> {
 #[derive(Clone, Debug)]
 struct Row<const N: usize> {
     states: States<N>,
-    /// Steps that lanes have taken since they were taken out of their plants; `None` where the state is in the plant.
-    taken: [Option<u64>; N],
-    /// Whether plants have moved since their states were written to them.
-    is_ahead: [bool; N],
+    /// Lanes with the state of their plant; those that take no part in a step have none after it.
+    taken: Truths<N>,
+    /// Steps that the lanes have taken together.
+    steps: u64,
+    /// How many those were when the states of plants were written last.
+    written: [u64; N],
 }
 
 impl Fleet {
@@ -136,17 +138,16 @@ impl Fleet {
         let Self { plants, resting, results, rows } = self;
         let width = plants.first().map_or(0, |plant| plant.model.dimensions.input());
         assert_eq!(inputs.len(), plants.len() * width, "entries of the inputs");
-        let input = |i: usize| &inputs[i * width..][..width];
         match rows {
             Rows::None => {
                 let all = plants.iter_mut().zip(results.iter_mut()).zip(&*resting);
                 for (i, ((plant, result), _)) in all.enumerate().filter(|(_, (_, rests))| !**rests)
                 {
-                    *result = plant.step(input(i));
+                    *result = plant.step(&inputs[i * width..][..width]);
                 }
             }
-            Rows::Fours(wide) => wide.step(plants, resting, results, input),
-            Rows::Eights(wide) => wide.step(plants, resting, results, input),
+            Rows::Fours(wide) => wide.step(plants, resting, results, inputs),
+            Rows::Eights(wide) => wide.step(plants, resting, results, inputs),
         }
         results
     }
@@ -189,10 +190,13 @@ impl Fleet {
 
 impl Rows {
     fn new(model: &Arc<Model>, settings: &Settings, count: usize) -> Self {
+        // Of many joints in planes, and without registers for them, eight at once do not fit into the nearest cache. One
+        // or two joints wait for each other, and eight plants fill the time.
+        let is_few = model.few_joints() > 0;
+        let is_wide = has(AVX512) && model.solver != Solver::Planar;
         if count < Row::<4>::FEW || !model.goes_abreast(settings) {
             Self::None
-        } else if count <= 4 || model.solver == Solver::Planar || !has(AVX512) {
-            // Of many joints in planes eight at once do not fit into the nearest cache.
+        } else if count <= 4 || !(is_few || is_wide) {
             Self::Fours(Box::new(Wide::new(model, settings, count)))
         } else {
             Self::Eights(Box::new(Wide::new(model, settings, count)))
@@ -229,26 +233,39 @@ impl Rows {
 
 impl<const N: usize> Wide<N> {
     fn new(model: &Arc<Model>, settings: &Settings, count: usize) -> Self {
-        let row = Row { states: States::new(model), taken: [None; N], is_ahead: [false; N] };
+        let states = States::new(model);
+        let row = Row { states, taken: Truths([0; N]), steps: 0, written: [0; N] };
         let (abreast, rows) = (Abreast::new(model, settings), vec![row; count.div_ceil(N)]);
         Self { model: Arc::clone(model), settings: *settings, abreast, rows }
     }
 
     /// Takes a step with all plants that do not rest.
-    fn step<'a>(
+    fn step(
         &mut self,
         plants: &mut [Plant],
         resting: &[bool],
         results: &mut [Result<StepReport, StepError>],
-        input: impl Fn(usize) -> &'a [f64],
+        inputs: &[f64],
     ) {
         let Self { model, settings, abreast, rows } = self;
         let mechanics = Mechanics { model, settings };
+        let width = model.dimensions.input();
         let parts = plants.chunks_mut(N).zip(results.chunks_mut(N)).zip(resting.chunks(N));
         for (i, (row, ((plants, results), resting))) in rows.iter_mut().zip(parts).enumerate() {
-            row.step(abreast, mechanics, plants, resting, results, |lane| input(i * N + lane));
+            let inputs = &inputs[i * N * width..][..plants.len() * width];
+            row.step(abreast, mechanics, Members { plants, results, resting, inputs, width });
         }
     }
+}
+
+/// The plants of a row, and what goes with each.
+struct Members<'a> {
+    plants: &'a mut [Plant],
+    results: &'a mut [Result<StepReport, StepError>],
+    resting: &'a [bool],
+    /// Those of one plant after those of the other, so many of each.
+    inputs: &'a [f64],
+    width: usize,
 }
 
 impl<const N: usize> Row<N> {
@@ -262,30 +279,29 @@ impl<const N: usize> Row<N> {
             && settings == own.settings
             && self.states.load(lane, settings, state, &workspace.response)
         {
-            self.taken[lane] = Some(0);
+            (self.taken.0[lane], self.written[lane]) = (u64::MAX, self.steps);
         }
     }
 
     fn leave(&mut self, lane: usize) {
-        if self.taken[lane].take().is_some() {
+        if std::mem::take(&mut self.taken.0[lane]) != 0 {
             self.states.clear(lane);
         }
     }
 
     fn write(&mut self, lane: usize, plant: &mut Plant) {
-        if let Some(taken) = &mut self.taken[lane]
-            && std::mem::take(&mut self.is_ahead[lane])
-        {
+        let taken = self.steps - self.written[lane];
+        if self.taken.of(lane) && taken > 0 {
             self.states.store(lane, &mut plant.state);
             let state = &mut plant.state;
-            state.step = state.step.saturating_add(*taken);
-            state.calm = state.calm.saturating_add((*taken).min(CALM.into()) as u8).min(CALM);
-            *taken = 0;
+            state.step = state.step.saturating_add(taken);
+            state.calm = state.calm.saturating_add(taken.min(CALM.into()) as u8).min(CALM);
+            self.written[lane] = self.steps;
         }
     }
 
     fn write_state(&self, lane: usize, q: &mut [f64], p: &mut [f64]) -> bool {
-        let is_here = self.taken[lane].is_some();
+        let is_here = self.taken.of(lane);
         if is_here {
             self.states.write(lane, q, p);
         }
@@ -293,52 +309,57 @@ impl<const N: usize> Row<N> {
     }
 
     /// Takes a step with all plants that do not rest.
-    fn step<'a>(
+    fn step(&mut self, abreast: &mut Abreast<N>, own: Mechanics<'_>, mut members: Members<'_>) {
+        let Members { plants, results, resting, inputs, width } = &mut members;
+        let is_worth = resting.iter().filter(|rests| !**rests).count() >= Self::FEW;
+        let mut done = Truths([0; N]);
+        if is_worth {
+            let are_finite = abreast.set_inputs(inputs, *width);
+            let (mut lanes, mut count) = (Truths([0; N]), 0);
+            for (lane, (plant, rests)) in plants.iter().zip(*resting).enumerate() {
+                if !self.taken.of(lane) && !rests {
+                    self.enter(lane, own, plant);
+                }
+                let moves = if *rests { 0 } else { self.taken.0[lane] & are_finite.0[lane] };
+                (lanes.0[lane], count) = (moves, count + usize::from(moves != 0));
+            }
+            if count >= Self::FEW {
+                done = abreast.solve(own.model, own.settings, &mut self.states, lanes, results);
+            }
+        }
+        if (0..plants.len()).all(|lane| done.of(lane)) {
+            abreast.move_on(own.model, &mut self.states);
+            self.steps += 1;
+        } else {
+            self.part(abreast, own, done, is_worth, members);
+        }
+    }
+
+    /// Those that are not done go on by themselves, from where they are, or rest.
+    #[cold]
+    fn part(
         &mut self,
         abreast: &mut Abreast<N>,
-        mechanics: Mechanics<'_>,
-        plants: &mut [Plant],
-        resting: &[bool],
-        results: &mut [Result<StepReport, StepError>],
-        input: impl Fn(usize) -> &'a [f64],
+        own: Mechanics<'_>,
+        done: Truths<N>,
+        is_worth: bool,
+        members: Members<'_>,
     ) {
-        let is_worth = resting.iter().filter(|rests| !**rests).count() >= Self::FEW;
-        let (mut lanes, mut count) = (Truths([0; N]), 0);
-        for (lane, plant) in plants.iter().enumerate() {
-            if resting[lane] || !is_worth || !input(lane).iter().all(|u| u.is_finite()) {
-                continue;
-            }
-            if self.taken[lane].is_none() {
-                self.enter(lane, mechanics, plant);
-            }
-            if self.taken[lane].is_some() {
-                abreast.set_inputs(lane, input(lane));
-                (lanes.0[lane], count) = (u64::MAX, count + 1);
-            }
-        }
-        let mut done = Truths([0; N]);
-        if is_worth && count >= Self::FEW {
-            let Mechanics { model, settings } = mechanics;
-            done = abreast.solve(model, settings, &mut self.states, lanes, results);
-        }
-        // Those that are not done go on by themselves, from where they are.
-        for (lane, plant) in plants.iter_mut().enumerate().filter(|(lane, _)| !done.of(*lane)) {
-            self.write(lane, plant);
+        let Members { plants, results, resting, inputs, width } = members;
+        let others = |lane: &usize| !done.of(*lane);
+        for lane in (0..plants.len()).filter(others) {
+            self.write(lane, &mut plants[lane]);
         }
         if done.0 != [0; N] {
-            abreast.move_on(mechanics.model, &mut self.states);
+            abreast.move_on(own.model, &mut self.states);
+            self.steps += 1;
         }
-        for (lane, plant) in plants.iter_mut().enumerate() {
-            if done.of(lane) {
-                self.taken[lane] = self.taken[lane].map(|taken| taken + 1);
-                self.is_ahead[lane] = true;
-                continue;
-            }
+        for lane in (0..plants.len()).filter(others) {
             self.leave(lane);
             if !resting[lane] {
-                results[lane] = plant.step(input(lane));
+                results[lane] = plants[lane].step(&inputs[lane * width..][..width]);
                 if is_worth {
-                    self.enter(lane, mechanics, plant);
+                    self.enter(lane, own, &plants[lane]);
                 }
             }
         }

@@ -502,9 +502,9 @@ pub(crate) fn in_sides<T: Beside<f64>>(count: usize, task: T) -> T::Output {
     }
 }
 
-/// Does it for one number.
+/// [`Beside`] of one real.
 #[inline(always)]
-pub fn alone<T: Beside<f64>>(task: T) -> T::Output {
+pub(crate) fn in_one<T: Beside<f64>>(task: T) -> T::Output {
     task.run::<Sides<f64, Block>>()
 }
 
