@@ -7,7 +7,7 @@
 //! is in `docs/figures.md`; tests hold each lane to the bits of the other loop. Of one joint, or of two in a row, lanes
 //! have a loop of their own ([`row`]).
 
-mod row;
+pub(crate) mod row;
 
 use std::f64::consts::PI;
 

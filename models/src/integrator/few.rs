@@ -5,8 +5,8 @@
 //! of a pendulum's was what goes from function to function by way of memory, and loops over lists of one number. All
 //! formulas are those of the other loop, on lists whose length the compiler knows ([`InARow`]). It knows the usual way of a
 //! step: bodies, inputs and damping, from a guess by past increments to convergence. A step that leaves it is taken by the
-//! other loop from its beginning. What it gains is in `docs/figures.md`; a test holds it to the bits of the other loop. Several plants
-//! side by side have a [row](super::abreast) of their own.
+//! other loop from its beginning. What it gains is in `docs/figures.md`; a test holds it to the bits of the other loop.
+//! Plants side by side have a loop of their own ([`row`](super::abreast::row)).
 
 use std::f64::consts::PI;
 

@@ -22,7 +22,7 @@ use crate::plant::solve::CALM;
 /// is stepped by itself.
 ///
 /// After construction steps allocate nothing, as those of plants. A step costs a plant what it costs it by itself;
-/// side by side, for each of many, half to a fifth of that.
+/// side by side, for each of many, two thirds to a fourth of that.
 ///
 /// ```
 /// use std::sync::Arc;
