@@ -122,7 +122,6 @@ def start_pinocchio():
     include = package_folder("pinocchio").parents[3] / "include"
     program, source = TARGET / "build" / "pinocchio", HERE / "drivers" / "pinocchio.cpp"
     if is_old(program, source):
-        write_dop853(program.with_name("dop853.h"))
         flags = ["-std=c++17", "-w", "-O3", "-march=native", "-DNDEBUG"]
         flags += ["-DBOOST_MPL_LIMIT_LIST_SIZE=30", "-DBOOST_MPL_CFG_NO_PREPROCESSED_HEADERS"]
         flags += ["-DBOOST_FUSION_INVOKE_MAX_ARITY=12"]
@@ -147,7 +146,8 @@ def start_casadi():
 
     program, source = TARGET / "build" / "casadi", HERE / "drivers" / "casadi.c"
     if is_old(program, source):
-        run(["gcc", "-O3", "-march=native", "-o", program, source, "-ldl"])
+        flags = ["-O3", "-march=native", f"-I{program.parent}"]
+        run(["gcc", *flags, "-o", program, source, "-ldl", "-lm"])
     return Driver([program], ".so")
 
 
@@ -164,12 +164,15 @@ START = {
     "CasADi C": start_casadi,
     "Drake": start_drake,
 }
-STRAIGHT_LINE = ["P", "D", "S", "C8", "C32", "T7", "T15", "T30"]
-STRAIGHT_LINE_DERIVATIVES = ["P", "D", "S", "C8", "T7", "T15", "T30"]
+# Hinges alone, and no more of them than a compiler takes in a few minutes.
+STRAIGHT_LINE = ["P", "D", "S", "C4", "C8", "C32", "T7", "T15", "T30", "panda", "g1-fixed"]
+STRAIGHT_LINE_DERIVATIVES = ["P", "D", "S", "C8", "T7", "T15", "T30", "panda"]
 
 
 def start_drivers():
     (TARGET / "build").mkdir(parents=True, exist_ok=True)
+    if not (header := TARGET / "build" / "dop853.h").exists():
+        write_dop853(header)
     drivers = {}
     for name, start in START.items():
         try:
@@ -209,12 +212,15 @@ AB_METHODS = [
 ROBOTS = ["panda", "g1-fixed", "go1", "anymal", "g1", "talos", "go1-feet", "stewart", "B7", "B15", "K8"]
 ROBOT_METHODS = [
     PLANTD,
+    ("CasADi C", "euler"),
     ("Pinocchio", "euler"),
     ("MuJoCo", "euler"),
     ("plantd", "midpoint-rough"),
+    ("CasADi C", "euler-rough"),
     ("Pinocchio", "euler-rough"),
     ("MuJoCo", "euler-rough"),
     PLANTD_AB,
+    ("CasADi C", "euler-ab"),
     ("Pinocchio", "euler-ab"),
 ]
 # plantd's method beside a peer's.
@@ -223,6 +229,9 @@ ROBOT_RATIOS = [
     (PLANTD, ("MuJoCo", "euler")),
     (("plantd", "midpoint-rough"), ("Pinocchio", "euler-rough")),
     (PLANTD_AB, ("Pinocchio", "euler-ab")),
+    (PLANTD, ("CasADi C", "euler")),
+    (("plantd", "midpoint-rough"), ("CasADi C", "euler-rough")),
+    (PLANTD_AB, ("CasADi C", "euler-ab")),
 ]
 TABLE = ["P", "D", "S", "L"]
 TABLE += [f"C{2**k}" for k in range(8)] + ["T7", "T15", "T30", "T63", "Z32", "Z128"]
@@ -248,12 +257,12 @@ def applies(name, method):
     driver, what = method
     if method == BY_HAND:
         return name == "P"
+    if driver == "CasADi C":
+        return name in (STRAIGHT_LINE_DERIVATIVES if what == "euler-ab" else STRAIGHT_LINE)
     if name in ROBOTS:
         return driver in ("plantd", "Pinocchio", "MuJoCo")
     if name == "L":
         return driver in ("plantd", "MuJoCo")
-    if driver == "CasADi C":
-        return name in (STRAIGHT_LINE_DERIVATIVES if what == "euler-ab" else STRAIGHT_LINE)
     return True
 
 
@@ -318,8 +327,8 @@ def measure_robots(drivers, names, rounds):
     for name in names:
         [(_, times)] = measure_calls(drivers, [name], ROBOT_METHODS, rounds).items()
         ends = []
-        for driver, method in [("plantd", "order-4"), ("Pinocchio", "rk4"), ("MuJoCo", "rk4")]:
-            if driver in drivers:
+        for driver, method in [("plantd", "order-4"), ("CasADi C", "rk4"), ("Pinocchio", "rk4"), ("MuJoCo", "rk4")]:
+            if driver in drivers and applies(name, (driver, method)):
                 ends.append(coordinates(name, driver, drivers[driver].ask(name, method, 1e-3, 100)[1]))
         measured[name] = times, max(error_of(q, ends[0]) for q in ends)
     return measured
@@ -396,8 +405,10 @@ ROBOT_CASES = [("panda", 1), ("go1", 1), ("g1", 1), ("B7", 1), ("go1-feet", 0.2)
 PRECISIONS = ("", "-fast", "-coarse")
 HIGH_ORDERS = [("plantd", f"order-{order}{to}") for order in (4, 6, 8, 12, 16) for to in PRECISIONS]
 FIXED_STEP = [PLANTD, *HIGH_ORDERS]
-FIXED_STEP += [m for m in STEP_METHODS if m[0] not in ("plantd", "CasADi C")]
-ADAPTIVE = [("Pinocchio", "dop853"), ("Drake", "rk3"), ("Drake", "rk5")]
+FIXED_STEP += [m for m in STEP_METHODS if m[0] not in ("plantd", "CasADi C")] + [("CasADi C", "rk4")]
+ADAPTIVE = [("Pinocchio", "dop853"), ("CasADi C", "dop853"), ("Drake", "rk3"), ("Drake", "rk5")]
+# Code of one mechanism is compared by itself.
+ENGINES = ["Pinocchio", "MuJoCo", "Drake"]
 LONGEST_SECONDS = 0.2
 # How many of the fastest, on each side, are asked again by turns.
 CANDIDATES = 4
@@ -449,13 +460,13 @@ def time_to_reach(points, error):
     return min((p.seconds for p in points if p.error <= error), default=None)
 
 
-def fastest(methods, is_own, error):
-    """Drivers and commands that are at least that exact, plantd's or its peers': the fastest few."""
+def fastest(methods, drivers, error):
+    """Drivers, of those that are given, and commands that are at least that exact: the fastest few."""
     found = [
         (point.seconds, driver, point.command)
         for (driver, _), points in methods.items()
         for point in points
-        if (driver == "plantd") == is_own and point.error <= error
+        if driver in drivers and point.error <= error
     ]
     return [(driver, command) for _, driver, command in sorted(found)[:CANDIDATES]]
 
@@ -493,18 +504,18 @@ def measure_accuracy(drivers, only):
     return curves
 
 
-def table_of_best(drivers, curves, rounds):
-    """plantd's time, order free, over that of the best peer, at each error, and their geometric means. The candidates
-    are asked again by turns: curves are found one after the other, while the machine slows now and then."""
-    lines = ["| plantd / best peer | " + " | ".join(f"{e:.0e}" for e in ERRORS) + f" | {ERRORS[1]:.0e} to {ERRORS[-1]:.0e} |"]
+def table_of_best(drivers, curves, rounds, what, peers):
+    """plantd's time, order free, over that of the best of its peers, at each error, and their geometric means. The
+    candidates are asked again by turns: curves are found one after the other, while the machine slows now and then."""
+    lines = [f"| plantd / {what} | " + " | ".join(f"{e:.0e}" for e in ERRORS) + f" | {ERRORS[1]:.0e} to {ERRORS[-1]:.0e} |"]
     lines.append("| --- |" + " ---: |" * (len(ERRORS) + 1))
     for (name, end), methods in curves.items():
         ratios = []
         for e in ERRORS:
-            own, peers = fastest(methods, True, e), fastest(methods, False, e)
-            if own and peers:
-                times = by_turns(drivers, own + peers, rounds)
-                ratios.append(min(times[c] for c in own) / min(times[c] for c in peers))
+            own, others = fastest(methods, ["plantd"], e), fastest(methods, peers, e)
+            if own and others:
+                times = by_turns(drivers, own + others, rounds)
+                ratios.append(min(times[c] for c in own) / min(times[c] for c in others))
             else:
                 ratios.append(None)
         met = [r for r in ratios[1:] if r]
@@ -578,6 +589,9 @@ def plot_calls(measured, path, title):
 # Report
 
 
+REGISTERS = {"avx512f": "AVX-512", "avx2": "AVX2", "avx": "AVX", "sse2": "SSE2"}
+
+
 def conditions():
     import importlib.metadata as metadata
 
@@ -587,11 +601,14 @@ def conditions():
             versions[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
             pass
-    processor = platform.processor()
+    about = {}
     for line in pathlib.Path("/proc/cpuinfo").read_text().splitlines():
-        if line.startswith("model name"):
-            processor = line.split(":", 1)[1].strip()
-            break
+        key, _, value = line.partition(":")
+        about.setdefault(key.strip(), value.strip())
+    flags = about.get("flags", "").split()
+    widest = next((name for flag, name in REGISTERS.items() if flag in flags), "no wide registers")
+    family = f"family {about.get('cpu family')}, model {about.get('model')}, {widest}"
+    processor = f"{about.get('model name', platform.processor())} ({family})"
     tool = lambda *command: subprocess.run(command, capture_output=True, text=True, cwd=ROOT).stdout
     commit = tool("git", "describe", "--always", "--dirty").strip()
     compilers = f"{tool('rustc', '--version').strip()}; {tool('g++', '--version').splitlines()[0]}"
@@ -646,7 +663,8 @@ def main():
         report += [*table_of_robots(robots), ""]
     if curves:
         report += ["## Run time against error", "", *table_of_accuracy(curves), ""]
-        report += [*table_of_best(drivers, curves, options.rounds), ""]
+        for what, peers in [("best engine", ENGINES), ("straight-line C", ["CasADi C"])]:
+            report += [*table_of_best(drivers, curves, options.rounds, what, peers), ""]
         plot_accuracy(curves, options.out / "accuracy.svg")
     if any(name[0] == "C" for name in names):
         plot_calls(steps, options.out / "steps.svg", "One step of a chain")

@@ -1,4 +1,4 @@
-"""Writes straight-line C for one mechanism with CasADi: python straight_line.py NAME FILE.c [euler-ab]"""
+"""Writes straight-line C for one mechanism of hinges with CasADi: python straight_line.py NAME FILE.c [euler-ab]"""
 
 import pathlib
 import sys
@@ -15,15 +15,31 @@ def cross(v):
 
 
 def rotation(axis, angle):
-    """From the parent's to the turned axes."""
-    c, s = ca.cos(angle), ca.sin(angle)
-    i = axis.index(1)
+    """From the axes of a joint to those that turn with it."""
+    if sorted(map(abs, axis)) != [0, 0, 1]:
+        k = ca.DM(cross(ca.DM(axis)))
+        return ca.DM.eye(3) - ca.sin(angle) * k + (1 - ca.cos(angle)) * (k @ k)
+    c, s = ca.cos(angle), ca.sin(angle) * sum(axis)
+    i = [abs(a) for a in axis].index(1)
     j, k = (i + 1) % 3, (i + 2) % 3
     e = ca.SX(3, 3)
     e[i, i] = 1
     e[j, j] = e[k, k] = c
     e[j, k], e[k, j] = s, -s
     return e
+
+
+def placed(turn):
+    """From the parent's axes to those of a joint, whose orientation there is a quaternion, w first."""
+    w, v = turn[0], ca.DM(turn[1:])
+    k = cross(v)
+    return ca.sparsify(ca.DM.eye(3) - 2 * w * k + 2 * k @ k)
+
+
+def tensor(inertia):
+    """Of moments, and products of inertia if there are any."""
+    xx, yy, zz, xy, xz, yz = [*inertia, 0, 0, 0][:6]
+    return ca.sparsify(ca.DM([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
 
 
 def motion_cross(v):
@@ -41,7 +57,7 @@ def accelerations(m, q, v, tau):
     n = len(m["bodies"])
     X, S, c, inertia, bias, velocity = ([None] * n for _ in range(6))
     for i, b in enumerate(m["bodies"]):
-        e = ca.sparsify(rotation(b["axis"], q[i]))
+        e = ca.sparsify(rotation(b["axis"], q[i]) @ placed(b.get("turn", [1, 0, 0, 0])))
         offset = ca.sparsify(ca.SX(cross(b["pos"])))
         X[i] = ca.sparsify(ca.blockcat([[e, ca.SX(3, 3)], [-e @ offset, e]]))
         S[i] = ca.sparsify(ca.SX(ca.DM(b["axis"] + [0, 0, 0])))
@@ -50,7 +66,7 @@ def accelerations(m, q, v, tau):
         velocity[i] = rate if parent < 0 else X[i] @ velocity[parent] + rate
         c[i] = ca.sparsify(motion_cross(velocity[i]) @ rate)
         lever = ca.DM(cross(ca.DM(b["com"])))
-        about_joint = ca.diag(ca.DM(b["inertia"])) + b["mass"] * lever @ lever.T
+        about_joint = tensor(b["inertia"]) + b["mass"] * lever @ lever.T
         mass = b["mass"] * ca.DM.eye(3)
         moment = b["mass"] * lever
         inertia[i] = ca.sparsify(ca.SX(ca.blockcat([[about_joint, moment], [moment.T, mass]])))
@@ -79,9 +95,11 @@ def main(name, path, methods):
     m = mechanisms.named(name)
     n = len(m["q0"])
     q, v, tau, h = ca.SX.sym("q", n), ca.SX.sym("v", n), ca.SX.sym("u", n), ca.SX.sym("h")
-    v_next = v + h * accelerations(m, q, v, tau)
+    a = accelerations(m, q, v, tau)
+    v_next = v + h * a
     q_next = q + h * v_next
-    functions = [ca.Function("euler", [q, v, tau, h], [q_next, v_next], {"cse": True})]
+    functions = [ca.Function("accelerations", [q, v, tau], [a], {"cse": True})]
+    functions.append(ca.Function("euler", [q, v, tau, h], [q_next, v_next], {"cse": True}))
     if "euler-ab" in methods:
         after = ca.vertcat(q_next, v_next)
         outputs = [q_next, v_next, ca.jacobian(after, ca.vertcat(q, v)), ca.jacobian(after, tau)]
@@ -92,9 +110,11 @@ def main(name, path, methods):
         generator.add(function)
         print(f"{name} {function.name()}: {function.n_instructions()} instructions")
     generator.generate(f"{path.parent}/")
-    start = ", ".join(map(repr, m["q0"] + m["v0"]))
+    lists = {"start": m["q0"] + m["v0"], "rough": m.get("rough", [0.0] * n)}
     with path.open("a") as file:
-        file.write(f"\nconst int mechanism_size = {n};\nconst double mechanism_start[] = {{{start}}};\n")
+        file.write(f"\nconst int mechanism_size = {n};\n")
+        for what, numbers in lists.items():
+            file.write(f"const double mechanism_{what}[] = {{{', '.join(map(repr, numbers))}}};\n")
 
 
 if __name__ == "__main__":
