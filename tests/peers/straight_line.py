@@ -105,11 +105,12 @@ def main(name, path, methods):
         outputs = [q_next, v_next, ca.jacobian(after, ca.vertcat(q, v)), ca.jacobian(after, tau)]
         functions.append(ca.Function("euler_ab", [q, v, tau, h], outputs, {"cse": True}))
     path = pathlib.Path(path)
-    generator = ca.CodeGenerator(path.name)
+    # A name of C.
+    generator = ca.CodeGenerator(path.stem.replace("-", "_"))
     for function in functions:
         generator.add(function)
         print(f"{name} {function.name()}: {function.n_instructions()} instructions")
-    generator.generate(f"{path.parent}/")
+    pathlib.Path(generator.generate(f"{path.parent}/")).rename(path)
     lists = {"start": m["q0"] + m["v0"], "rough": m.get("rough", [0.0] * n)}
     with path.open("a") as file:
         file.write(f"\nconst int mechanism_size = {n};\n")
