@@ -403,7 +403,7 @@ impl<const N: usize> LanesOf<N> {
         }
     }
 
-    /// The largest of the numbers, of which there is a power of two.
+    /// The largest of the numbers.
     #[inline(always)]
     pub fn largest(self) -> f64 {
         const { assert!(N.is_power_of_two()) };
