@@ -74,9 +74,9 @@ class Driver:
 
 
 def model_file(name, suffix):
-    """The mechanism in a peer's format, written or compiled if it is not there."""
+    """The mechanism in a peer's format, written or compiled if it is not there, or is of what these scripts were."""
     path = TARGET / "build" / f"{name}{suffix}"
-    if path.exists():
+    if not is_old(path, HERE / "mechanisms.py", HERE / "straight_line.py"):
         return path
     if suffix == ".so":
         source = path.with_suffix(".c")
@@ -111,7 +111,7 @@ def start_plantd():
 def start_mujoco():
     folder = package_folder("mujoco")
     program, source = TARGET / "build" / "mujoco", HERE / "drivers" / "mujoco.c"
-    if is_old(program, source):
+    if is_old(program, source, source.with_name("driver.h")):
         [library] = folder.glob("libmujoco.so.*")
         flags = ["-O3", "-march=native", f"-I{folder}/include", f"-Wl,-rpath,{folder}"]
         run(["gcc", *flags, "-o", program, source, library])
@@ -121,7 +121,7 @@ def start_mujoco():
 def start_pinocchio():
     include = package_folder("pinocchio").parents[3] / "include"
     program, source = TARGET / "build" / "pinocchio", HERE / "drivers" / "pinocchio.cpp"
-    if is_old(program, source):
+    if is_old(program, source, source.with_name("driver.h")):
         flags = ["-std=c++17", "-w", "-O3", "-march=native", "-DNDEBUG"]
         flags += ["-DBOOST_MPL_LIMIT_LIST_SIZE=30", "-DBOOST_MPL_CFG_NO_PREPROCESSED_HEADERS"]
         flags += ["-DBOOST_FUSION_INVOKE_MAX_ARITY=12"]
@@ -145,7 +145,7 @@ def start_casadi():
     import casadi  # noqa: F401
 
     program, source = TARGET / "build" / "casadi", HERE / "drivers" / "casadi.c"
-    if is_old(program, source):
+    if is_old(program, source, source.with_name("driver.h")):
         flags = ["-O3", "-march=native", f"-I{program.parent}"]
         run(["gcc", *flags, "-o", program, source, "-ldl", "-lm"])
     return Driver([program], ".so")

@@ -5,8 +5,6 @@
 // torques that change at each step.
 
 #include <dlfcn.h>
-#include <math.h>
-#include <stdbool.h>
 #include <stdlib.h>
 
 #include "dop853.h"  // A, B, E3, E5 of the pair, written by compare.py
@@ -84,14 +82,14 @@ static void go(struct mechanism *m, double h, const double *weights, int count) 
   }
 }
 
-// Hairer, Nørsett, Wanner: Solving Ordinary Differential Equations I, II.5. False if the motion is lost.
+// False if the motion is lost.
 static bool dop853(struct mechanism *m, double end, double tolerance) {
   const int n = 2 * m->n;
-  double t = 0, h = 0.01;
-  bool rejected = false;
+  double t = 0;
+  struct stride stride = {0.01, false};
   rate(m, m->y, m->rates[0]);
   while (t < end) {
-    h = fmin(h, end - t);
+    const double h = stride.h = fmin(stride.h, end - t);
     for (int s = 1; s < 12; ++s) {
       go(m, h, DOP853_A[s], s);
       rate(m, m->stage, m->rates[s]);
@@ -109,20 +107,13 @@ static bool dop853(struct mechanism *m, double end, double tolerance) {
       third += e3 / scale * (e3 / scale);
       fifth += e5 / scale * (e5 / scale);
     }
-    const double sum = fifth + 0.01 * third;
-    const double error = sum == 0 ? 0 : h * fifth / sqrt(sum * n);
+    const double error = dop853_error(h, third, fifth, n);
     if (!isfinite(error)) return false;
-    const double factor = error == 0 ? 10 : 0.9 * pow(error, -1.0 / 8);
-    if (error < 1) {
+    if (dop853_accept(&stride, error)) {
       t += h;
       memcpy(m->y, m->stage, (size_t)n * sizeof(double));
       double *last = m->rates[12];
       m->rates[12] = m->rates[0], m->rates[0] = last;
-      h *= fmin(rejected ? 1 : 10, factor);
-      rejected = false;
-    } else {
-      h *= fmax(0.2, factor);
-      rejected = true;
     }
   }
   return true;

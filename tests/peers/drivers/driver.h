@@ -8,6 +8,8 @@
 #ifndef DRIVER_H
 #define DRIVER_H
 
+#include <math.h>
+#include <stdbool.h>
 #include <stdio.h>
 #include <string.h>
 #include <time.h>
@@ -37,6 +39,28 @@ static double rough_number(long step, long motor) {
   x = (x ^ (x >> 13)) * 3266489917u;
   x ^= x >> 16;
   return (double)x * (2.0 / 4294967296.0) - 1.0;
+}
+
+// How long the steps of DOP853 are: Hairer, Nørsett, Wanner, Solving Ordinary Differential Equations I, II.5.
+struct stride {
+  double h;
+  bool rejected;
+};
+
+// The error of a step, 1 at the tolerance, from the squares of the estimates of third and fifth order of so many
+// numbers, each over its scale.
+static double dop853_error(double h, double third, double fifth, double count) {
+  const double sum = fifth + 0.01 * third;
+  return sum == 0 ? 0 : h * fifth / sqrt(sum * count);
+}
+
+// Whether a step with that error is taken; the next one, or the same again, is as long as suits it.
+static bool dop853_accept(struct stride *stride, double error) {
+  const double factor = error == 0 ? 10 : 0.9 * pow(error, -1.0 / 8);
+  const bool accepted = error < 1;
+  stride->h *= accepted ? fmin(stride->rejected ? 1 : 10, factor) : fmax(0.2, factor);
+  stride->rejected = !accepted;
+  return accepted;
 }
 
 static void answer(double seconds, const double *q, int n) {

@@ -193,14 +193,13 @@ public:
     move(h);
   }
 
-  // Hairer, Nørsett, Wanner: Solving Ordinary Differential Equations I, II.5.
   void dop853(double end, double tolerance) {
-    double t = 0, h = 0.01;
+    double t = 0;
+    struct stride stride = {0.01, false};
     y_ << q, v;
     rate(y_, 0);
-    bool rejected = false;
     while (t < end) {
-      h = std::min(h, end - t);
+      const double h = stride.h = std::min(stride.h, end - t);
       for (int s = 1; s < 12; ++s) {
         stage_.noalias() = y_ + h * (k_.leftCols(s) * Eigen::Map<const VectorXd>(DOP853_A[s], s));
         rate(stage_, s);
@@ -212,19 +211,12 @@ public:
           ((k_ * Eigen::Map<const VectorXd>(DOP853_E5, 13)).cwiseQuotient(scale_)).squaredNorm();
       const double third =
           ((k_ * Eigen::Map<const VectorXd>(DOP853_E3, 13)).cwiseQuotient(scale_)).squaredNorm();
-      const double sum = fifth + 0.01 * third;
-      const double error = sum == 0 ? 0 : h * fifth / std::sqrt(sum * double(nq_ + n_));
+      const double error = dop853_error(h, third, fifth, nq_ + n_);
       if (!std::isfinite(error)) throw std::runtime_error("the motion is lost");
-      double factor = error == 0 ? 10 : 0.9 * std::pow(error, -1.0 / 8);
-      if (error < 1) {
+      if (dop853_accept(&stride, error)) {
         t += h;
         y_.swap(stage_);
         k_.col(0) = k_.col(12);
-        h *= std::min(rejected ? 1.0 : 10.0, factor);
-        rejected = false;
-      } else {
-        h *= std::max(0.2, factor);
-        rejected = true;
       }
     }
     q = y_.head(nq_);
