@@ -309,8 +309,8 @@ impl Continuous {
         let (d, elimination) = (self.equations.d, &model.elimination);
         let (n, nd, nc) = (d.coordinates(), d.dynamic, d.constraints);
         for row in 0..nd {
-            for slot in elimination.offsets[row]..elimination.offsets[row + 1] {
-                let entry = elimination.ancestors[slot] * n + row;
+            for (slot, ancestor) in elimination.entries_of(row) {
+                let entry = ancestor * n + row;
                 let entry = self.equations.blocks.l_vv[entry].re;
                 (self.mass.upper[slot], self.mass.lower[slot]) = (entry, entry);
             }

@@ -28,6 +28,8 @@ pub const UNITS: [Block; LANES] = {
 pub trait Eight: Copy + 'static {
     /// The same, of which the first four are of use.
     type Four: Eight;
+    /// Whether the first of them alone is of use.
+    const IS_ALONE: bool = false;
     /// Zeros.
     const ZERO: Self;
     /// Ones.
@@ -209,6 +211,7 @@ impl Eight for Block {
 /// The first of eight numbers alone, where the others are of no use.
 impl Eight for f64 {
     type Four = Self;
+    const IS_ALONE: bool = true;
     const ZERO: Self = 0.0;
     const ONE: Self = 1.0;
     #[inline(always)]

@@ -6,14 +6,21 @@
 //! so one factorization serves every scene.
 
 use std::collections::BTreeSet;
+use std::ops::Range;
+
+/// Entries of which rows have whole numbers, so that they are computed with in registers: what is beyond the diagonal
+/// means nothing.
+pub(crate) const TOGETHER: usize = 4;
 
 /// The elimination tree.
 #[derive(Clone, Debug, Default)]
 pub struct SymbolicElimination {
-    /// Row `j` owns `ancestors[offsets[j]..offsets[j + 1]]`.
-    pub offsets: Vec<usize>,
-    /// Ancestors of each row, root first, the row itself last.
-    pub ancestors: Vec<usize>,
+    /// Where each row begins, and where the last one ends.
+    offsets: Vec<usize>,
+    /// The slot of the diagonal of each row, with which it ends.
+    diagonals: Vec<usize>,
+    /// Ancestors of each row, root first, the row itself last, and then some more times.
+    ancestors: Vec<usize>,
     /// Row `i` owns `descendants[descendant_offsets[i]..descendant_offsets[i + 1]]`.
     descendant_offsets: Vec<usize>,
     /// Proper descendants of each row, and the slots of their entries with it.
@@ -45,7 +52,10 @@ impl SymbolicElimination {
                 path.push(p);
             }
             path.reverse();
+            let end = elimination.ancestors.len() + path.len();
+            elimination.diagonals.push(end - 1);
             elimination.ancestors.extend(path);
+            elimination.ancestors.resize(end.next_multiple_of(TOGETHER), j);
             elimination.offsets.push(elimination.ancestors.len());
         }
         elimination.descendant_offsets = vec![0];
@@ -55,7 +65,7 @@ impl SymbolicElimination {
             let below: Vec<_> = below.collect();
             elimination.descendants.extend(below);
             elimination.descendant_offsets.push(elimination.descendants.len());
-            let above = elimination.offsets[i]..elimination.offsets[i + 1];
+            let above = elimination.row(i);
             elimination.coupled.extend_from_slice(&elimination.ancestors[above]);
             let below = elimination.descendant_offsets[i];
             let below = elimination.descendants[below..].iter().map(|(j, _)| *j);
@@ -77,22 +87,61 @@ impl SymbolicElimination {
 
     /// Rows.
     pub fn rows(&self) -> usize {
-        self.offsets.len() - 1
+        self.diagonals.len()
     }
 
-    /// Stored entries of one triangle, diagonal included.
-    pub fn entries(&self) -> usize {
+    /// The slots of a row, the last of which is that of the diagonal.
+    #[inline(always)]
+    pub fn row(&self, row: usize) -> Range<usize> {
+        self.offsets[row]..self.diagonals[row] + 1
+    }
+
+    /// The slot of a row's diagonal.
+    #[inline(always)]
+    pub fn diagonal(&self, row: usize) -> usize {
+        self.diagonals[row]
+    }
+
+    /// Where rows begin, so many of the first ones.
+    pub(crate) fn offsets(&self, rows: usize) -> &[usize] {
+        &self.offsets[..=rows]
+    }
+
+    /// Proper ancestors of a row, root first.
+    #[inline(always)]
+    pub fn above(&self, row: usize) -> &[usize] {
+        &self.ancestors[self.offsets[row]..self.diagonals[row]]
+    }
+
+    /// The slots of a row, and whose entries with it they are.
+    pub fn entries_of(&self, row: usize) -> impl Iterator<Item = (usize, usize)> {
+        let slots = self.row(row);
+        slots.clone().zip(self.ancestors[slots].iter().copied())
+    }
+
+    /// Slots of one triangle, those that mean nothing included.
+    pub fn slots(&self) -> usize {
         self.ancestors.len()
+    }
+
+    /// How many entries each row has, its diagonal included.
+    pub fn lengths(&self) -> impl Iterator<Item = usize> {
+        (0..self.rows()).map(|row| self.row(row).len())
+    }
+
+    /// Entries of one triangle, diagonal included.
+    pub fn entries(&self) -> usize {
+        self.lengths().sum()
     }
 
     /// Independent blocks.
     pub fn islands(&self) -> usize {
-        self.offsets.windows(2).filter(|w| w[1] - w[0] == 1).count()
+        self.lengths().filter(|length| *length == 1).count()
     }
 
     /// Place of the entry of `descendant` with `ancestor`.
     pub fn slot(&self, descendant: usize, ancestor: usize) -> Option<usize> {
-        let range = self.offsets[descendant]..self.offsets[descendant + 1];
+        let range = self.row(descendant);
         let start = range.start;
         self.ancestors[range].binary_search(&ancestor).ok().map(|k| start + k)
     }

@@ -93,7 +93,6 @@ impl<S: Scalar> Quaternion<S> {
             (high[i], next[i]) = two_sum(self.0[i], of_high[i] + (low[i] + of_low[i]));
         }
         // To length 1: that is no turn.
-        let dot = |a: [S; 4], b: [S; 4]| (a[0] * b[0] + a[1] * b[1]) + (a[2] * b[2] + a[3] * b[3]);
         let excess = (dot(high, high) - 1.0) * 0.5 + dot(high, next);
         for i in 0..4 {
             next[i] -= excess * high[i];
@@ -216,6 +215,12 @@ fn polynomial<S: Scalar>(y: Vec3<S>, a: S, b: S) -> Mat3<S> {
         Vec3([xy - turn[2], diagonal(0, 2), yz + turn[0]]),
         Vec3([xz + turn[1], yz - turn[0], diagonal(0, 1)]),
     ])
+}
+
+/// The product of four numbers with four others. A closure would be a call between registers.
+#[inline(always)]
+fn dot<S: Scalar>(a: [S; 4], b: [S; 4]) -> S {
+    (a[0] * b[0] + a[1] * b[1]) + (a[2] * b[2] + a[3] * b[3])
 }
 
 /// `δ ↦ δ × v`.

@@ -1,7 +1,7 @@
 //! LU factorization without pivoting along the elimination tree: the non-symmetric twin of
 //! Featherstone's LTL, without fill-in. O(n·depth²) to factor, O(n·depth) to solve.
 
-use crate::elimination::SymbolicElimination;
+use crate::elimination::{SymbolicElimination, TOGETHER};
 use crate::rows::{LANES, Term, add_rows_portable, padded};
 use crate::scalar::{Beside, Compared, LanesOf, Scalar, Wide};
 use crate::simd::widest;
@@ -61,15 +61,21 @@ impl<S: Compared> Beside<S> for Factor<'_, S> {
         let Self { matrix, elimination, scale, factor } = self;
         let rows = scale.len();
         let TreeLu { upper, lower, inverse_pivot, reference, .. } = matrix;
-        let offsets = &elimination.offsets[..=rows];
+        let offsets = elimination.offsets(rows);
         let (inverse_pivot, reference) = (&mut inverse_pivot[..rows], &mut reference[..rows]);
-        for ((reference, end), scale) in reference.iter_mut().zip(&offsets[1..]).zip(scale) {
-            *reference = upper[end - 1].abs().max(S::constant(scale * factor));
+        for (k, (reference, scale)) in reference.iter_mut().zip(scale).enumerate() {
+            let diagonal = upper[elimination.diagonal(k)];
+            *reference = diagonal.abs().max(S::constant(scale * factor));
         }
+        // What is beyond the diagonal of a row is computed with it where that is one operation.
+        let width = |entries: usize| match W::TAKES_FOURS {
+            true => entries.next_multiple_of(TOGETHER),
+            false => entries,
+        };
         let mut smallest = SmallestPivot::NONE;
         for k in (0..rows).rev() {
             let start = offsets[k];
-            let ancestors = &elimination.ancestors[start..offsets[k + 1] - 1];
+            let ancestors = elimination.above(k);
             let depth = ancestors.len();
             let (upper_above, upper_row) = upper.split_at_mut(start);
             let (lower_above, lower_row) = lower.split_at_mut(start);
@@ -77,14 +83,16 @@ impl<S: Compared> Beside<S> for Factor<'_, S> {
             smallest.see(k, pivot, reference[k]);
             let inverse = pivot.recip();
             inverse_pivot[k] = inverse;
-            for entry in &mut upper_row[..depth] {
+            for entry in &mut upper_row[..width(depth)] {
                 *entry = *entry * inverse;
             }
             for (d, &ancestor) in ancestors.iter().enumerate().rev() {
-                let target = offsets[ancestor];
                 let (l, u) = (lower_row[d], upper_row[d]);
-                W::subtract(l, &upper_row[..=d], &mut upper_above[target..=target + d]);
-                W::subtract(u, &lower_row[..d], &mut lower_above[target..target + d]);
+                let (upper_above, lower_above) =
+                    (&mut upper_above[offsets[ancestor]..], &mut lower_above[offsets[ancestor]..]);
+                let [above, own] = [d, d + 1].map(width);
+                W::subtract(l, &upper_row[..own], &mut upper_above[..own]);
+                W::subtract(u, &lower_row[..above], &mut lower_above[..above]);
             }
         }
         smallest
@@ -95,8 +103,8 @@ impl<S: Compared> TreeLu<S> {
     /// Of a matrix with that elimination tree; all entries are zero.
     pub fn new(elimination: &SymbolicElimination) -> Self {
         Self {
-            upper: vec![S::ZERO; elimination.entries()],
-            lower: vec![S::ZERO; elimination.entries()],
+            upper: vec![S::ZERO; elimination.slots()],
+            lower: vec![S::ZERO; elimination.slots()],
             inverse_pivot: vec![S::ZERO; elimination.rows()],
             reference: vec![S::ZERO; elimination.rows()],
             terms: Vec::with_capacity(elimination.rows()),
@@ -105,7 +113,7 @@ impl<S: Compared> TreeLu<S> {
 
     /// Makes room for a matrix that had none.
     pub fn make_room(&mut self, elimination: &SymbolicElimination) {
-        if self.upper.len() != elimination.entries() {
+        if self.upper.len() != elimination.slots() {
             *self = Self::new(elimination);
         }
     }
@@ -163,22 +171,16 @@ impl<S: Compared> TreeLu<S> {
     #[inline(always)]
     pub fn substitute(&self, elimination: &SymbolicElimination, x: &mut [S]) {
         let rows = x.len();
-        let (offsets, inverse_pivot) = (&elimination.offsets[..=rows], &self.inverse_pivot[..rows]);
+        let (offsets, inverse_pivot) = (elimination.offsets(rows), &self.inverse_pivot[..rows]);
         for k in (0..rows).rev() {
-            let range = offsets[k]..offsets[k + 1] - 1;
             let value = x[k];
-            for (&ancestor, u) in
-                elimination.ancestors[range.clone()].iter().zip(&self.upper[range])
-            {
+            for (&ancestor, u) in elimination.above(k).iter().zip(&self.upper[offsets[k]..]) {
                 x[ancestor] -= *u * value;
             }
         }
         for k in 0..rows {
-            let range = offsets[k]..offsets[k + 1] - 1;
             let mut value = x[k];
-            for (&ancestor, l) in
-                elimination.ancestors[range.clone()].iter().zip(&self.lower[range])
-            {
+            for (&ancestor, l) in elimination.above(k).iter().zip(&self.lower[offsets[k]..]) {
                 value -= *l * x[ancestor];
             }
             x[k] = value * inverse_pivot[k];
@@ -258,12 +260,12 @@ impl TreeLu {
                 add_rows_portable(&mut row[rest..columns], &below[rest..], stride, &self.terms);
             }
             for i in 0..elimination.rows() {
-                let range = elimination.offsets[i]..elimination.offsets[i + 1] - 1;
                 let (above, row) = x.split_at_mut(i * stride);
                 let row = &mut row[..columns];
-                let ancestors = elimination.ancestors[range.clone()].iter();
+                let ancestors = elimination.above(i).iter();
+                let lower = &self.lower[elimination.row(i)];
                 self.terms.clear();
-                self.terms.extend(ancestors.zip(&self.lower[range]).map(|(&j, l)| (-l, j)));
+                self.terms.extend(ancestors.zip(lower).map(|(&j, l)| (-l, j)));
                 add_rows_portable(row, above, stride, &self.terms);
                 let inverse = self.inverse_pivot[i];
                 row.iter_mut().for_each(|entry| *entry *= inverse);
@@ -291,8 +293,7 @@ mod tests {
         let n = elimination.rows();
         let (mut lu, mut dense) = (TreeLu::new(elimination), DMatrix::zeros(n, n));
         for row in 0..n {
-            for slot in elimination.offsets[row]..elimination.offsets[row + 1] {
-                let ancestor = elimination.ancestors[slot];
+            for (slot, ancestor) in elimination.entries_of(row) {
                 let (u, l) = ((slot as f64 * 0.7).sin(), (slot as f64 * 1.3).cos());
                 let (u, l) = if ancestor == row { (6.0 + u, 6.0 + u) } else { (u, l) };
                 (lu.upper[slot], lu.lower[slot]) = (u, l);
@@ -340,8 +341,8 @@ mod tests {
         let elimination = elimination();
         let (mut lu, _) = matrix(&elimination);
         // Row 7 hangs from row 6 alone: make their block singular.
-        let (diagonal, coupling) = (elimination.offsets[8] - 1, elimination.offsets[7]);
-        let root = elimination.offsets[7] - 1;
+        let (diagonal, coupling) = (elimination.diagonal(7), elimination.row(7).start);
+        let root = elimination.diagonal(6);
         (lu.upper[diagonal], lu.upper[coupling], lu.lower[coupling], lu.upper[root]) =
             (2.0, 2.0, 2.0, 2.0);
         let smallest = lu.factor(&elimination, &[0.0; 8], 1.0);
@@ -352,7 +353,7 @@ mod tests {
     fn nan_is_the_smallest_pivot() {
         let elimination = elimination();
         let (mut lu, _) = matrix(&elimination);
-        lu.upper[elimination.offsets[5] - 1] = f64::NAN;
+        lu.upper[elimination.diagonal(4)] = f64::NAN;
         assert_eq!(lu.factor(&elimination, &[0.0; 8], 1.0).relative, 0.0);
     }
 }

@@ -25,8 +25,7 @@ impl Model {
         let (nd, nc) = (d.dynamic as f64, d.constraints as f64);
         let entries = self.elimination.entries() as f64;
         // Of a factorization entry by entry: each row changes those of its ancestors.
-        let changes: f64 =
-            self.elimination.offsets.windows(2).map(|row| ((row[1] - row[0]) as f64).powi(2)).sum();
+        let changes: f64 = self.elimination.lengths().map(|entries| (entries as f64).powi(2)).sum();
         let support: Vec<f64> =
             self.constraints.iter().map(|c| c.coordinates.len() as f64).collect();
 

@@ -84,10 +84,9 @@ impl Model {
             }
         }
         let mut kept: Vec<Run> = Vec::new();
-        let offsets = &self.elimination.offsets;
         for k in (0..d.dynamic).filter(|k| !is_held(k)) {
-            for from in offsets[k]..offsets[k + 1] {
-                let to = rest.slot(k, self.elimination.ancestors[from])?;
+            for (from, ancestor) in self.elimination.entries_of(k) {
+                let to = rest.slot(k, ancestor)?;
                 match kept.last_mut() {
                     Some(Run { from: a, to: b, len }) if (*a + *len, *b + *len) == (from, to) => {
                         *len += 1;
@@ -103,8 +102,7 @@ impl Model {
 
     /// The coordinates above one in its elimination.
     fn above(&self, k: usize) -> &[usize] {
-        let SymbolicElimination { offsets, ancestors, .. } = &self.elimination;
-        &ancestors[offsets[k]..offsets[k + 1] - 1]
+        self.elimination.above(k)
     }
 
     /// The lowest of some coordinates in each of the two chains that they are in, the last one first.

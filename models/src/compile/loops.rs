@@ -374,7 +374,7 @@ impl Model {
 
     /// Multiplications and additions of dense matrices of the constraints.
     fn dense_work(&self) -> f64 {
-        let rows = self.elimination.offsets.windows(2).map(|row| (row[1] - row[0]) as f64);
+        let rows = self.elimination.lengths().map(|entries| entries as f64);
         let (entries, changes) = rows.fold((0.0, 0.0), |(n, sum), row| (n + row, sum + row * row));
         let support: usize = self.constraints.iter().map(|c| c.coordinates.len()).sum();
         let nc = self.dimensions.constraints as f64;

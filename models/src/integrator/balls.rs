@@ -255,8 +255,7 @@ impl Workspace {
             let own = &balls.within[joint.orientation];
             for (row, column) in [(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)] {
                 // The axes of a joint come last among those that its rows are coupled with.
-                let end = model.elimination.offsets[joint.coordinate + row + 1];
-                let slot = end - 1 - row + column;
+                let slot = model.elimination.diagonal(joint.coordinate + row) - row + column;
                 matrix.upper[slot] = own[column][row];
                 matrix.lower[slot] = own[row][column];
             }
@@ -304,7 +303,7 @@ impl Workspace {
             armature::add_to(matrix, model, entry, -1.0 / h);
         }
         for (i, c) in model.damping.iter().enumerate().filter(|(i, _)| balls.of(*i).is_none()) {
-            let slot = model.elimination.offsets[i + 1] - 1;
+            let slot = model.elimination.diagonal(i);
             matrix.add_to_diagonal(slot, -a * c);
         }
     }

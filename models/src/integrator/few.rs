@@ -137,13 +137,14 @@ impl Workspace {
                 let matrix = &mut kkt.factored.tree;
                 row.differentiate_here(joints);
                 row.place_here(joints);
-                for (below, first) in model.elimination.offsets.iter().enumerate().take(N) {
+                for below in 0..N {
+                    let first = model.elimination.row(below).start;
                     for above in 0..=below {
                         row.fill_entry(joints, [above, below], h, (matrix, first + above));
                     }
                 }
                 for (i, c) in damping.iter().enumerate() {
-                    matrix.add_to_diagonal(model.elimination.offsets[i + 1] - 1, -at_start * c);
+                    matrix.add_to_diagonal(model.elimination.diagonal(i), -at_start * c);
                 }
                 let pivot = matrix.factor_few(&model.elimination, inertia, 1.0 / h.abs());
                 if !(pivot.relative >= settings.singular_below) {

@@ -193,7 +193,7 @@ impl<S: Planar> Midpoint<S> {
             }
         }
         for (i, c) in model.damping.iter().enumerate() {
-            let slot = model.elimination.offsets[i + 1] - 1;
+            let slot = model.elimination.diagonal(i);
             matrix.add_to_diagonal(slot, S::constant(-settings.force_split.at_start() * c));
         }
         if let Some(forces) = &model.forces {

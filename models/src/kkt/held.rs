@@ -161,7 +161,7 @@ impl HeldLimbs {
             lower[to..to + len].copy_from_slice(&matrix.lower[from..from + len]);
         }
         for i in held.limbs.iter().flat_map(|limb| limb.coordinates.clone()) {
-            upper[held.rest.offsets[i]] = 1.0;
+            upper[held.rest.row(i).start] = 1.0;
         }
     }
 
@@ -333,11 +333,11 @@ impl<const N: usize> Factors<N> {
         [start, end]: [&Closure; 2],
     ) {
         let (n, count) = (model.dimensions.coordinates(), plan.above);
-        let offsets = &model.elimination.offsets;
+        let start_of = |i: usize| model.elimination.row(i).start;
         for (a, i) in plan.coordinates.clone().enumerate() {
             for b in 0..=a {
-                self.own[a][b] = matrix.lower[offsets[i] + count + b];
-                self.own[b][a] = matrix.upper[offsets[i] + count + b];
+                self.own[a][b] = matrix.lower[start_of(i) + count + b];
+                self.own[b][a] = matrix.upper[start_of(i) + count + b];
             }
         }
         for (border, (place, rows)) in
@@ -353,7 +353,8 @@ impl<const N: usize> Factors<N> {
             }
             for (k, i) in plan.coordinates.clone().enumerate() {
                 // Of what moves the place where it is held alone, there is nothing.
-                let slots = offsets[i] + place.min(count)..offsets[i] + count.min(place + LANES);
+                let slots = place.min(count)..count.min(place + LANES);
+                let slots = start_of(i) + slots.start..start_of(i) + slots.end;
                 rows.upper[k].0 = taken(&matrix.upper[slots.clone()]);
                 rows.lower[k].0 = taken(&matrix.lower[slots]);
             }

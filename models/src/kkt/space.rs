@@ -118,15 +118,14 @@ pub(crate) struct SpatialRecursion<const B: usize> {
     axes: Vec<Generators<Line<B>>>,
     /// `K` of each group by itself; once it is eliminated, `D⁻¹`.
     within: Vec<Square>,
-    /// `A` and its transpose, by rows, where limbs meet. As trees are walked depth first, there are few, which
-    /// stay in the nearest cache.
+    /// `A` where limbs meet. As trees are walked depth first, there are few, which stay in the nearest cache.
     sums: Vec<Kept<B>>,
     /// Flows of right-hand sides, and twists that belong to solutions.
     flows: Vec<Line<B>>,
 }
 
-/// `A` and its transpose in memory, by rows.
-type Kept<const B: usize> = [[[Line<B>; 8]; B]; 2];
+/// `A` in memory, by rows.
+type Kept<const B: usize> = [[Line<B>; 8]; B];
 
 /// The recursion that a model needs.
 #[derive(Clone, Debug)]
@@ -171,30 +170,52 @@ impl Spatial {
     }
 }
 
-/// `A` in registers.
+/// `A` in registers, by rows.
 #[derive(Clone, Copy)]
 struct Sums<E, const B: usize> {
     rows: Lines<E, B>,
-    columns: Lines<E, B>,
+}
+
+/// The same by rows and by columns. These are the rows turned, once for a group: to keep both is more work.
+#[derive(Clone, Copy)]
+struct Both<'a, E, const B: usize> {
+    rows: &'a Lines<E, B>,
+    columns: &'a Lines<E, B>,
 }
 
 impl<E: Eight, const B: usize> Sums<E, B> {
     #[inline(always)]
     fn zero() -> Self {
-        Self { rows: [[InLine::ZERO; 8]; B], columns: [[InLine::ZERO; 8]; B] }
+        Self { rows: [[InLine::ZERO; 8]; B] }
     }
 
     /// The first blocks of what has more.
     #[inline(always)]
-    fn of<const L: usize>([rows, columns]: &Kept<L>) -> Self {
+    fn of<const L: usize>(rows: &Kept<L>) -> Self {
         let mut sums = Self::zero();
         for b in 0..B {
             for k in 0..8 {
                 sums.rows[b][k] = InLine::of(&rows[b][k]);
-                sums.columns[b][k] = InLine::of(&columns[b][k]);
             }
         }
         sums
+    }
+
+    #[inline(always)]
+    fn columns(&self) -> Lines<E, B> {
+        let mut columns = [[InLine::ZERO; 8]; B];
+        for (b, columns) in columns.iter_mut().enumerate() {
+            for (c, rows) in self.rows.iter().enumerate() {
+                let mut block = [E::ZERO; 8];
+                for (own, row) in block.iter_mut().zip(rows) {
+                    *own = row.0[b];
+                }
+                for (column, turned) in columns.iter_mut().zip(E::transposed(block)) {
+                    column.0[c] = turned;
+                }
+            }
+        }
+        columns
     }
 
     #[inline(always)]
@@ -202,7 +223,6 @@ impl<E: Eight, const B: usize> Sums<E, B> {
         for b in 0..B {
             for k in 0..8 {
                 self.rows[b][k] = self.rows[b][k].plus(o.rows[b][k]);
-                self.columns[b][k] = self.columns[b][k].plus(o.columns[b][k]);
             }
         }
         self
@@ -211,22 +231,19 @@ impl<E: Eight, const B: usize> Sums<E, B> {
     /// Leaves the first block alone.
     #[inline(always)]
     fn end(&mut self) {
-        for sums in [&mut self.rows, &mut self.columns] {
-            for (b, lines) in sums.iter_mut().enumerate() {
-                for line in lines {
-                    *line = if b == 0 { line.ended() } else { InLine::ZERO };
-                }
+        for (b, lines) in self.rows.iter_mut().enumerate() {
+            for line in lines {
+                *line = if b == 0 { line.ended() } else { InLine::ZERO };
             }
         }
     }
 
     /// To the first blocks of what has more.
     #[inline(always)]
-    fn put<const L: usize>(&self, [rows, columns]: &mut Kept<L>) {
+    fn put<const L: usize>(&self, rows: &mut Kept<L>) {
         for b in 0..B {
             for k in 0..8 {
                 self.rows[b][k].put(&mut rows[b][k]);
-                self.columns[b][k].put(&mut columns[b][k]);
             }
         }
     }
@@ -389,7 +406,7 @@ impl<const B: usize> SpatialRecursion<B> {
             limbs,
             groups,
             axes: vec![Generators::default(); joints],
-            sums: vec![[[[Line::ZERO; 8]; B]; 2]; places],
+            sums: vec![[[Line::ZERO; 8]; B]; places],
             flows: vec![Line::ZERO; places],
         }
     }
@@ -445,7 +462,7 @@ trait Watch<E, const B: usize> {
         at: usize,
         group: &Group,
         axes: &[Generators<Line<B>>],
-        sums: Option<&Sums<E, U>>,
+        sums: Option<Both<'_, E, U>>,
     );
 }
 
@@ -457,7 +474,7 @@ impl<E, const B: usize> Watch<E, B> for () {
         _: usize,
         _: &Group,
         _: &[Generators<Line<B>>],
-        _: Option<&Sums<E, U>>,
+        _: Option<Both<'_, E, U>>,
     ) {
     }
 }
@@ -559,13 +576,19 @@ impl<const B: usize> SpatialRecursion<B> {
             };
             let is_root = limb.hangs_from.is_none() && at + 1 == limb.groups.end;
             let axes = &self.axes[group.axes.clone()];
-            watch.see(at, group, axes, carries.then_some(&sums));
+            let mut columns = None;
+            let mut below = None;
+            if carries {
+                let columns = columns.insert(sums.columns());
+                below = Some(Both { rows: &sums.rows, columns });
+            }
+            watch.see(at, group, axes, below);
             if !matches!(group.kind, GroupKind::Prescribed(_)) {
-                let sums = &mut sums;
+                let sums = (&mut sums, columns.as_ref());
                 match &mut self.axes[group.axes.clone()] {
-                    [a] => eliminate([a], within, sums, carries, is_root, see),
-                    [a, b] => eliminate([a, b], within, sums, carries, is_root, see),
-                    [a, b, c] => eliminate([a, b, c], within, sums, carries, is_root, see),
+                    [a] => eliminate([a], within, sums, is_root, see),
+                    [a, b] => eliminate([a, b], within, sums, is_root, see),
+                    [a, b, c] => eliminate([a, b, c], within, sums, is_root, see),
                     _ => {}
                 }
                 carries = true;
@@ -579,7 +602,7 @@ impl<const B: usize> SpatialRecursion<B> {
             if !is_first {
                 sums = sums.plus(&Sums::of(all));
             } else if U < B {
-                *all = [[[Line::ZERO; 8]; B]; 2];
+                *all = [[Line::ZERO; 8]; B];
             }
             sums.put(all);
         }
@@ -603,13 +626,13 @@ fn write_within<E: Eight, const B: usize, const U: usize, const W: usize>(
     }
 }
 
-/// Eliminates the axes of a group; `see` takes an axis, its pivot, and what stands in `K` in its place.
+/// Eliminates the axes of a group, with the columns of `A` where it is not zero; `see` takes an axis, its pivot, and
+/// what stands in `K` in its place.
 #[inline(always)]
 fn eliminate<E: Eight, const B: usize, const U: usize, const W: usize>(
     axes: [&mut Generators<Line<B>>; W],
     within: &mut Square,
-    sums: &mut Sums<E, U>,
-    carries: bool,
+    (sums, columns): (&mut Sums<E, U>, Option<&Lines<E, U>>),
     is_root: bool,
     mut see: impl FnMut(usize, f64, f64),
 ) {
@@ -620,9 +643,9 @@ fn eliminate<E: Eight, const B: usize, const U: usize, const W: usize>(
         u[a] = InLine::of(&axes[a].upper);
         w[a] = InLine::of(&axes[a].lower);
     }
-    if carries {
+    if let Some(columns) = columns {
         for b in 0..W {
-            let product = combined(&sums.columns, &axes[b].plus);
+            let product = combined(columns, &axes[b].plus);
             u[b] = u[b].plus(product);
             w[b] = w[b].plus(combined(&sums.rows, &axes[b].minus));
             for (row, axis) in d.iter_mut().zip(&axes) {
@@ -651,10 +674,8 @@ fn eliminate<E: Eight, const B: usize, const U: usize, const W: usize>(
         // Number by number from memory, where compilers would take the registers apart.
         let axis: &Generators<Line<B>> = black_box(&*axes[a]);
         for b in 0..U {
-            let (rows, columns) = (&mut sums.rows[b], &mut sums.columns[b]);
-            for k in 0..8 {
-                rows[k] = rows[k].minus(w_over_d[a].scaled(axis.upper.0[b].0[k]));
-                columns[k] = columns[k].minus(u[a].scaled(axis.lower.0[b].0[k]));
+            for (row, upper) in sums.rows[b].iter_mut().zip(&axis.upper.0[b].0) {
+                *row = row.minus(w_over_d[a].scaled(*upper));
             }
         }
     }

@@ -36,7 +36,7 @@ pub(crate) fn add_to<S: Compared>(
     let &Armature { row, column, inertia } = entry;
     let added = S::constant(times * inertia);
     if row == column {
-        matrix.add_to_diagonal(model.elimination.offsets[row + 1] - 1, added);
+        matrix.add_to_diagonal(model.elimination.diagonal(row), added);
     } else {
         matrix.add(&model.elimination, row, column, added);
     }

@@ -19,7 +19,8 @@ pub(crate) struct Poses<S: Scalar = f64> {
     sides: Sided<Pose<S::Several>>,
     /// Position of a joint relative to what it hangs from.
     edge: Vec<Vec3<S>>,
-    /// Angles by which hinges and screws turn about their axes, in their order, and their sines and cosines.
+    /// Angles by which hinges and screws turn about their axes, in their order, and their sines and cosines: whole fours,
+    /// as many as are found at once, of which the last may be zero.
     angles: Vec<S>,
     turns: Vec<[S; 2]>,
 }
@@ -79,7 +80,8 @@ fn moving<S: Scalar, W: Wide<S>>([x, y, z]: &[W::Triple; 3], v: &Vec3<S>) -> W::
 impl<S: Scalar> Poses<S> {
     pub(crate) fn new(tree: &Tree) -> Self {
         let n = tree.joints.len();
-        let turns = tree.joints.iter().filter(|joint| joint.kind.turns_about_axis()).count();
+        let hinges = tree.joints.iter().filter(|joint| joint.kind.turns_about_axis()).count();
+        let turns = if S::BESIDE > 1 { hinges.next_multiple_of(4) } else { hinges };
         Self {
             rotation: vec![Mat3::IDENTITY; n],
             position: vec![Vec3::ZERO; n],

@@ -517,8 +517,7 @@ coefficient = 0.03
             workspace.fill_newton_matrix(&model, &settings);
             let (mut found, mut expected) = (Vec::new(), Vec::new());
             for row in 0..nd {
-                for slot in model.elimination.offsets[row]..model.elimination.offsets[row + 1] {
-                    let column = model.elimination.ancestors[slot];
+                for (slot, column) in model.elimination.entries_of(row) {
                     let tree = &workspace.kkt.factored.tree;
                     found.push(tree.upper[slot]);
                     expected.push(blocks.residual_next[column * n + row]);

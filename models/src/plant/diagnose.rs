@@ -83,8 +83,7 @@ impl Plant {
         let elimination = &model.elimination;
         let mut matrix = DMatrix::zeros(nd, nd);
         for row in 0..nd {
-            for slot in elimination.offsets[row]..elimination.offsets[row + 1] {
-                let ancestor = elimination.ancestors[slot];
+            for (slot, ancestor) in elimination.entries_of(row) {
                 matrix[(row, ancestor)] = workspace.kkt.factored.tree.lower[slot];
                 // The diagonal is kept in the upper triangle alone.
                 matrix[(ancestor, row)] = workspace.kkt.factored.tree.upper[slot];

@@ -35,6 +35,8 @@ pub trait Wide<S: Scalar>: Scalar {
     fn dot_of(a: Self::Line, b: Self::Line) -> S;
     /// The sum of the products of two lines, and of two more.
     fn dots(a: [Self::Line; 2], b: [Self::Line; 2]) -> S;
+    /// Whether [`Wide::subtract`] takes four numbers in one operation.
+    const TAKES_FOURS: bool = false;
     /// Subtracts from each number of a list that of another one, times a factor.
     fn subtract(factor: S, source: &[S], target: &mut [S]);
     /// Three numbers that belong together.
@@ -300,9 +302,16 @@ impl<E: Eight, L: Eight> Wide<f64> for Sides<E, L> {
         Self::new(E::all(*number))
     }
     type Line = L;
+    const TAKES_FOURS: bool = !E::IS_ALONE;
     #[inline(always)]
     fn subtract(factor: f64, source: &[f64], target: &mut [f64]) {
-        for (t, s) in target.iter_mut().zip(source) {
+        let ((fours, rest), (sources, others)) =
+            (target.as_chunks_mut::<4>(), source.as_chunks::<4>());
+        for (t, s) in fours.iter_mut().zip(sources) {
+            let product = L::Four::of_list(s).scaled(factor);
+            L::Four::of_list(t).minus(product).put_list(t);
+        }
+        for (t, s) in rest.iter_mut().zip(others) {
             *t -= factor * *s;
         }
     }

@@ -65,14 +65,15 @@ impl<const N: usize, const K: usize> Row<N, K> {
         self.joints.differentiate_here(joints);
         self.joints.place_here(joints);
         let (elimination, inertia) = (&model.elimination, &model.conditioning.inertia[..K]);
-        for (below, first) in elimination.offsets.iter().enumerate().take(K) {
+        for below in 0..K {
+            let first = elimination.row(below).start;
             for above in 0..=below {
                 self.joints.fill_entry(joints, [above, below], h, (matrix, first + above));
             }
         }
         for (i, c) in self.damping.iter().enumerate() {
             let slope = LanesOf::constant(-force_split.at_start() * c);
-            matrix.add_to_diagonal(elimination.offsets[i + 1] - 1, slope);
+            matrix.add_to_diagonal(elimination.diagonal(i), slope);
         }
         self.pivot = matrix.factor_few(elimination, inertia, 1.0 / h.abs()).relative;
     }

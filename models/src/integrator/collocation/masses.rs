@@ -29,7 +29,7 @@ impl<const N: usize> Masses<N> {
         let (groups, nd) = (width / N, model.dimensions.dynamic);
         Self {
             groups,
-            entries: vec![LanesOf::ZERO; groups * model.elimination.entries()],
+            entries: vec![LanesOf::ZERO; groups * model.elimination.slots()],
             inverse: vec![LanesOf::ZERO; groups * nd],
             right: vec![LanesOf::ZERO; nd],
             secants: Secants::new(nd * count),
@@ -79,9 +79,8 @@ impl<const N: usize> Masses<N> {
             let entries = self.entries.as_chunks_mut::<GROUPS>().0;
             let inverse = self.inverse.as_chunks_mut::<GROUPS>().0;
             for k in (0..elimination.rows()).rev() {
-                let start = elimination.offsets[k];
-                let ancestors = &elimination.ancestors[start..elimination.offsets[k + 1] - 1];
-                let (above, row) = entries.split_at_mut(start);
+                let ancestors = elimination.above(k);
+                let (above, row) = entries.split_at_mut(elimination.row(k).start);
                 let depth = ancestors.len();
                 inverse[k] = row[depth].map(Scalar::recip);
                 for (d, &ancestor) in ancestors.iter().enumerate().rev() {
@@ -89,7 +88,7 @@ impl<const N: usize> Masses<N> {
                     for (factor, inverse) in factor.iter_mut().zip(inverse[k]) {
                         *factor = *factor * inverse;
                     }
-                    let target = &mut above[elimination.offsets[ancestor]..][..=d];
+                    let target = &mut above[elimination.row(ancestor).start..][..=d];
                     for (target, own) in target.iter_mut().zip(&row[..=d]) {
                         for g in 0..GROUPS {
                             target[g] -= factor[g] * own[g];
@@ -107,17 +106,15 @@ impl<const N: usize> Masses<N> {
             let (elimination, groups) = (&model.elimination, self.groups);
             let Self { entries, inverse, right, .. } = self;
             for k in (0..elimination.rows()).rev() {
-                let range = elimination.offsets[k]..elimination.offsets[k + 1] - 1;
                 let value = right[k];
-                for (&ancestor, slot) in elimination.ancestors[range.clone()].iter().zip(range) {
+                for (&ancestor, slot) in elimination.above(k).iter().zip(elimination.row(k)) {
                     right[ancestor] -= entries[slot * groups + g] * value;
                 }
                 right[k] = value * inverse[k * groups + g];
             }
             for k in 0..elimination.rows() {
-                let range = elimination.offsets[k]..elimination.offsets[k + 1] - 1;
                 let mut value = right[k];
-                for (&ancestor, slot) in elimination.ancestors[range.clone()].iter().zip(range) {
+                for (&ancestor, slot) in elimination.above(k).iter().zip(elimination.row(k)) {
                     value -= entries[slot * groups + g] * right[ancestor];
                 }
                 right[k] = value;

@@ -251,8 +251,7 @@ fn dense(workspace: &mut Workspace, model: &Model, settings: &Settings) -> DMatr
     let (tree, elimination) = (&workspace.kkt.factored.tree, &model.elimination);
     let mut dense = DMatrix::zeros(nd + nc, nd + nc);
     for row in 0..nd {
-        for slot in elimination.offsets[row]..elimination.offsets[row + 1] {
-            let ancestor = elimination.ancestors[slot];
+        for (slot, ancestor) in elimination.entries_of(row) {
             dense[(row, ancestor)] = tree.lower[slot];
             dense[(ancestor, row)] = tree.upper[slot];
         }

@@ -6,7 +6,7 @@ use plantd_math::spatial::Mat3;
 use crate::kkt::planar::Diagonals;
 use crate::kkt::space::lines::{InLine, Line, combined};
 use crate::kkt::space::vectors::{Margin, Vectors};
-use crate::kkt::space::{Group, GroupKind, SpatialRecursion, Square, Sums, Watch};
+use crate::kkt::space::{Both, Group, GroupKind, SpatialRecursion, Square, Watch};
 use crate::lagrangian::generators::Generators;
 use crate::lagrangian::turning::Turning;
 
@@ -74,7 +74,7 @@ impl<E: Eight, const B: usize> Watch<E, B> for Keep<'_, B> {
         at: usize,
         group: &Group,
         axes: &[Generators<Line<B>>],
-        sums: Option<&Sums<E, U>>,
+        sums: Option<Both<'_, E, U>>,
     ) {
         let Self { kept, vectors, own } = self;
         let first = group.axes.start;
@@ -108,7 +108,7 @@ impl<E: Eight, const B: usize> Watch<E, B> for Keep<'_, B> {
                 let Some(sums) = sums else { return };
                 for Margin { carry, push, above, below } in margins {
                     for (above, below) in [(above, below), (carry, push)] {
-                        InLine::of(below).plus(combined(&sums.columns, above)).put(below);
+                        InLine::of(below).plus(combined(sums.columns, above)).put(below);
                     }
                 }
                 return;
@@ -148,7 +148,7 @@ fn write_among<E: Eight, const B: usize, const U: usize, const W: usize>(
     margins: &mut [Margin<Line<B>>],
     [residual, by_start, by_increment]: [&[f64]; 3],
     among: &mut Among,
-    sums: Option<&Sums<E, U>>,
+    sums: Option<Both<'_, E, U>>,
 ) {
     for a in 0..W {
         let [minus, plus] = [InLine::<E, U>::of(&axes[a].minus), InLine::of(&axes[a].plus)];
@@ -180,11 +180,11 @@ fn include<E: Eight, const B: usize, const U: usize, const W: usize>(
     axes: [&Generators<Line<B>>; W],
     margins: &mut [Margin<Line<B>>],
     among: &mut Among,
-    sums: &Sums<E, U>,
+    sums: Both<'_, E, U>,
 ) {
     for b in 0..W {
-        let above = combined(&sums.columns, &margins[b].above);
-        let plus = combined(&sums.columns, &axes[b].plus);
+        let above = combined(sums.columns, &margins[b].above);
+        let plus = combined(sums.columns, &axes[b].plus);
         for a in 0..W {
             let carry = InLine::<E, U>::of(&margins[a].carry);
             among.residual[a][b] += InLine::of(&axes[a].minus).dot(above);
@@ -193,6 +193,6 @@ fn include<E: Eight, const B: usize, const U: usize, const W: usize>(
         }
         let Margin { carry, push, below, .. } = &mut margins[b];
         InLine::of(below).plus(above).put(below);
-        InLine::of(push).plus(combined(&sums.rows, carry)).put(push);
+        InLine::of(push).plus(combined(sums.rows, carry)).put(push);
     }
 }

@@ -111,8 +111,7 @@ fn dense(model: &Model, matrix: &TreeLu) -> DMatrix<f64> {
     let n = model.dimensions.dynamic;
     let mut dense = DMatrix::zeros(n, n);
     for row in 0..n {
-        for slot in model.elimination.offsets[row]..model.elimination.offsets[row + 1] {
-            let ancestor = model.elimination.ancestors[slot];
+        for (slot, ancestor) in model.elimination.entries_of(row) {
             dense[(row, ancestor)] = matrix.lower[slot];
             dense[(ancestor, row)] = matrix.upper[slot];
         }

@@ -274,8 +274,7 @@ impl Contraction {
         let elimination = &model.elimination;
         matrix.clear();
         for i in 0..nd {
-            let slots = elimination.offsets[i]..elimination.offsets[i + 1];
-            for &j in &elimination.ancestors[slots] {
+            for (_, j) in elimination.entries_of(i) {
                 matrix.add(elimination, i, j, entry(blocks, i, j));
                 if i != j {
                     matrix.add(elimination, j, i, entry(blocks, j, i));
