@@ -44,8 +44,8 @@ impl<S: Compared> SmallestPivot<S> {
     }
 }
 
-/// What [`TreeLu::factor`] does.
-struct Factor<'a, S: Scalar> {
+/// What [`TreeLu::factor`] does; `IN_A_ROW`: each row but the first has the one before for its parent.
+struct Factor<'a, S: Scalar, const IN_A_ROW: bool> {
     matrix: &'a mut TreeLu<S>,
     elimination: &'a SymbolicElimination,
     /// One of each row.
@@ -53,7 +53,7 @@ struct Factor<'a, S: Scalar> {
     factor: f64,
 }
 
-impl<S: Compared> Beside<S> for Factor<'_, S> {
+impl<S: Compared, const IN_A_ROW: bool> Beside<S> for Factor<'_, S, IN_A_ROW> {
     type Output = SmallestPivot<S>;
 
     #[inline(always)]
@@ -61,11 +61,10 @@ impl<S: Compared> Beside<S> for Factor<'_, S> {
         let Self { matrix, elimination, scale, factor } = self;
         let rows = scale.len();
         let TreeLu { upper, lower, inverse_pivot, reference, .. } = matrix;
-        let offsets = elimination.offsets(rows);
+        let [starts, diagonals] = elimination.places(rows);
         let (inverse_pivot, reference) = (&mut inverse_pivot[..rows], &mut reference[..rows]);
-        for (k, (reference, scale)) in reference.iter_mut().zip(scale).enumerate() {
-            let diagonal = upper[elimination.diagonal(k)];
-            *reference = diagonal.abs().max(S::constant(scale * factor));
+        for ((reference, diagonal), scale) in reference.iter_mut().zip(diagonals).zip(scale) {
+            *reference = upper[*diagonal].abs().max(S::constant(scale * factor));
         }
         // What is beyond the diagonal of a row is computed with it where that is one operation.
         let width = |entries: usize| match W::TAKES_FOURS {
@@ -73,8 +72,8 @@ impl<S: Compared> Beside<S> for Factor<'_, S> {
             false => entries,
         };
         let mut smallest = SmallestPivot::NONE;
-        for k in (0..rows).rev() {
-            let start = offsets[k];
+        for k in eliminated::<IN_A_ROW>(elimination, rows) {
+            let start = starts[k];
             let ancestors = elimination.above(k);
             let depth = ancestors.len();
             let (upper_above, upper_row) = upper.split_at_mut(start);
@@ -88,8 +87,9 @@ impl<S: Compared> Beside<S> for Factor<'_, S> {
             }
             for (d, &ancestor) in ancestors.iter().enumerate().rev() {
                 let (l, u) = (lower_row[d], upper_row[d]);
+                let start = starts[ancestor];
                 let (upper_above, lower_above) =
-                    (&mut upper_above[offsets[ancestor]..], &mut lower_above[offsets[ancestor]..]);
+                    (&mut upper_above[start..], &mut lower_above[start..]);
                 let [above, own] = [d, d + 1].map(width);
                 W::subtract(l, &upper_row[..own], &mut upper_above[..own]);
                 W::subtract(u, &lower_row[..above], &mut lower_above[..above]);
@@ -97,6 +97,16 @@ impl<S: Compared> Beside<S> for Factor<'_, S> {
         }
         smallest
     }
+}
+
+/// Rows as they are eliminated.
+#[inline(always)]
+fn eliminated<const IN_A_ROW: bool>(
+    elimination: &SymbolicElimination,
+    rows: usize,
+) -> impl DoubleEndedIterator<Item = usize> {
+    let order = elimination.order();
+    (0..rows).map(move |i| if IN_A_ROW { rows - 1 - i } else { order[i] })
 }
 
 impl<S: Compared> TreeLu<S> {
@@ -147,10 +157,12 @@ impl<S: Compared> TreeLu<S> {
         scale: &[f64],
         factor: f64,
     ) -> SmallestPivot<S> {
-        S::beside(scale.len(), Factor { matrix: self, elimination, scale, factor })
+        let task = Factor::<S, false> { matrix: self, elimination, scale, factor };
+        S::beside(scale.len(), task)
     }
 
-    /// [`Self::factor`] number by number, in the code of the caller, which may know how many rows there are.
+    /// [`Self::factor`] of rows that are one below the other, number by number, in the code of the caller, which may know
+    /// how many there are.
     #[inline(always)]
     pub fn factor_few(
         &mut self,
@@ -158,29 +170,30 @@ impl<S: Compared> TreeLu<S> {
         scale: &[f64],
         factor: f64,
     ) -> SmallestPivot<S> {
-        S::alone(Factor { matrix: self, elimination, scale, factor })
+        S::alone(Factor::<S, true> { matrix: self, elimination, scale, factor })
     }
 
     /// Solves `K x = b` in place.
     #[inline(never)]
     pub fn solve(&self, elimination: &SymbolicElimination, x: &mut [S]) {
-        self.substitute(elimination, x);
+        self.substitute::<false>(elimination, x);
     }
 
-    /// [`Self::solve`] in the registers of the caller.
+    /// [`Self::solve`] in the registers of the caller; `IN_A_ROW`: each row but the first has the one before for its
+    /// parent, and the caller may know how many there are.
     #[inline(always)]
-    pub fn substitute(&self, elimination: &SymbolicElimination, x: &mut [S]) {
+    pub fn substitute<const IN_A_ROW: bool>(&self, elimination: &SymbolicElimination, x: &mut [S]) {
         let rows = x.len();
-        let (offsets, inverse_pivot) = (elimination.offsets(rows), &self.inverse_pivot[..rows]);
-        for k in (0..rows).rev() {
+        let ([starts, _], inverse_pivot) = (elimination.places(rows), &self.inverse_pivot[..rows]);
+        for k in eliminated::<IN_A_ROW>(elimination, rows) {
             let value = x[k];
-            for (&ancestor, u) in elimination.above(k).iter().zip(&self.upper[offsets[k]..]) {
+            for (&ancestor, u) in elimination.above(k).iter().zip(&self.upper[starts[k]..]) {
                 x[ancestor] -= *u * value;
             }
         }
-        for k in 0..rows {
+        for k in eliminated::<IN_A_ROW>(elimination, rows).rev() {
             let mut value = x[k];
-            for (&ancestor, l) in elimination.above(k).iter().zip(&self.lower[offsets[k]..]) {
+            for (&ancestor, l) in elimination.above(k).iter().zip(&self.lower[starts[k]..]) {
                 value -= *l * x[ancestor];
             }
             x[k] = value * inverse_pivot[k];

@@ -43,7 +43,7 @@ fn each<W: Wide<f64>>(wide: &Mat3<W>, count: usize, mut take: impl FnMut(usize, 
 
 /// Components of a list, by their first coordinates. Where it does not reach, as of what is prescribed, they are others.
 #[inline(always)]
-fn collect<W: Wide<f64>>(coordinates: &[usize], list: &[f64], mut others: Vec3<Block>) -> Vec3<W> {
+fn collect<W: Wide<f64>>(coordinates: &[usize], list: &[f64], others: Vec3<Block>) -> Vec3<W> {
     let numbers = |i: usize| list.get(i..i + 3);
     if let [one] = coordinates {
         // Nothing to be put together.
@@ -52,12 +52,16 @@ fn collect<W: Wide<f64>>(coordinates: &[usize], list: &[f64], mut others: Vec3<B
             None => wide::<W, _>(&others),
         };
     }
-    for (lane, &i) in coordinates.iter().enumerate() {
-        if let Some(numbers) = numbers(i) {
-            (0..3).for_each(|k| others.0[k].0[lane] = numbers[k]);
+    let Vec3([Block(x), Block(y), Block(z)]) = others;
+    let mut threes = [[0.0; 3]; BESIDE];
+    for (lane, three) in threes.iter_mut().enumerate() {
+        *three = [x[lane], y[lane], z[lane]];
+        if let Some(numbers) = coordinates.get(lane).and_then(|i| numbers(*i)) {
+            three.copy_from_slice(numbers);
         }
     }
-    wide::<W, _>(&others)
+    let component = |k: usize| W::each(|lane| threes[lane][k]);
+    Vec3([component(0), component(1), component(2)])
 }
 
 /// The way back.
@@ -86,13 +90,12 @@ fn fours<W: Wide<f64>, T>(list: &[T], of: impl Fn(&T) -> [f64; 4]) -> [W; 4] {
     if let [one] = list {
         return one_of(of(one));
     }
-    let mut lanes = [Block::ZERO; 4];
-    for (lane, own) in list.iter().enumerate() {
-        let four = of(own);
-        (0..4).for_each(|k| lanes[k].0[lane] = four[k]);
+    let mut fours = [[0.0; 4]; BESIDE];
+    for (four, own) in fours.iter_mut().zip(list) {
+        *four = of(own);
     }
-    let [a, b, c, d] = &lanes;
-    [W::load(a), W::load(b), W::load(c), W::load(d)]
+    let component = |k: usize| W::each(|lane| fours[lane][k]);
+    [component(0), component(1), component(2), component(3)]
 }
 
 /// The way back.

@@ -138,7 +138,7 @@ impl Workspace {
                 row.differentiate_here(joints);
                 row.place_here(joints);
                 for below in 0..N {
-                    let first = model.elimination.row(below).start;
+                    let first = model.elimination.start(below);
                     for above in 0..=below {
                         row.fill_entry(joints, [above, below], h, (matrix, first + above));
                     }
@@ -157,7 +157,7 @@ impl Workspace {
             if report.iterations == 1 && size <= CONVERGED {
                 break;
             }
-            kkt.factored.tree.substitute(&model.elimination, &mut r);
+            kkt.factored.tree.substitute::<true>(&model.elimination, &mut r);
             for i in 0..N {
                 x[i] -= r[i];
             }

@@ -161,7 +161,7 @@ impl HeldLimbs {
             lower[to..to + len].copy_from_slice(&matrix.lower[from..from + len]);
         }
         for i in held.limbs.iter().flat_map(|limb| limb.coordinates.clone()) {
-            upper[held.rest.row(i).start] = 1.0;
+            upper[held.rest.start(i)] = 1.0;
         }
     }
 
@@ -333,7 +333,7 @@ impl<const N: usize> Factors<N> {
         [start, end]: [&Closure; 2],
     ) {
         let (n, count) = (model.dimensions.coordinates(), plan.above);
-        let start_of = |i: usize| model.elimination.row(i).start;
+        let start_of = |i: usize| model.elimination.start(i);
         for (a, i) in plan.coordinates.clone().enumerate() {
             for b in 0..=a {
                 self.own[a][b] = matrix.lower[start_of(i) + count + b];

@@ -83,26 +83,16 @@ fn collect<S: Scalar, W: Wide<S>>(slots: &Slots, i: usize, list: &[S]) -> W {
     if !slots.are_in_order {
         return collect_of(&slots.coordinates[0][i..i + S::BESIDE], list);
     }
-    if let Some(numbers) = list.get(i..i + S::BESIDE) {
-        return W::load(&S::several(|lane| numbers[lane]));
+    match list.get(i..i + S::BESIDE) {
+        Some(numbers) => W::load(&S::several(|lane| numbers[lane])),
+        None => W::each(|lane| list.get(i + lane).copied().unwrap_or(S::ZERO)),
     }
-    let mut several = S::Several::default();
-    for (lane, number) in list.iter().skip(i).take(S::BESIDE).enumerate() {
-        number.put(&mut several, lane);
-    }
-    W::load(&several)
 }
 
 /// Numbers of coordinates from a list; zero beyond it.
 #[inline(always)]
 fn collect_of<S: Scalar, W: Wide<S>>(coordinates: &[usize], list: &[S]) -> W {
-    let mut several = S::Several::default();
-    for (lane, coordinate) in coordinates.iter().enumerate() {
-        if let Some(number) = list.get(*coordinate) {
-            number.put(&mut several, lane);
-        }
-    }
-    W::load(&several)
+    W::each(|lane| list.get(coordinates[lane]).copied().unwrap_or(S::ZERO))
 }
 
 /// The way back, but for what is beyond the list.

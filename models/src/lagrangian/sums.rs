@@ -14,7 +14,8 @@ use crate::model::tree::{Tree, WORLD};
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Sums<S: Scalar> {
     rows: Vec<S::Row>,
-    ninths: Vec<S>,
+    /// Apart, as they are written one by one: what is read as a whole after that waits.
+    ninths: Vec<[S; 2]>,
 }
 
 /// Where slots begin that are side by side.
@@ -33,7 +34,7 @@ impl<S: Scalar> Sums<S> {
     pub(crate) fn new(slots: &Slots) -> Self {
         Self {
             rows: vec![S::Row::default(); slots.nothing() + 1],
-            ninths: vec![S::ZERO; slots.nothing()],
+            ninths: vec![[S::ZERO; 2]; slots.nothing()],
         }
     }
 
@@ -49,7 +50,7 @@ impl<S: Scalar> Sums<S> {
         self.put(i, [a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1]]);
         let mut several = S::Several::default();
         c[2].store(&mut several);
-        for (lane, ninth) in self.ninths[i..i + S::BESIDE].iter_mut().enumerate() {
+        for (lane, [ninth, _]) in self.ninths[i..i + S::BESIDE].iter_mut().enumerate() {
             *ninth = S::one(&several, lane);
         }
     }
@@ -83,10 +84,10 @@ impl<S: Scalar> Sums<S> {
         let [p, q, r, s, t, u, x, y] = self.take_from::<W, BALLS>(i, links);
         let z = if BALLS {
             let links = &links[i..i + S::BESIDE];
-            W::load(&S::several(|lane| self.ninths[links[lane]]))
+            W::each(|lane| self.ninths[links[lane]][0])
         } else {
             let ninths = &self.ninths[i..i + S::BESIDE];
-            W::load(&S::several(|lane| ninths[lane]))
+            W::each(|lane| ninths[lane][0])
         };
         [Vec3([p, q, r]), Vec3([s, t, u]), Vec3([x, y, z])]
     }
@@ -123,7 +124,7 @@ impl<S: Scalar> Sums<S> {
             }
             below = sum;
             if NINTH {
-                let sum = &mut self.ninths[i];
+                let [sum, _] = &mut self.ninths[i];
                 if is_followed {
                     *sum += below_ninth;
                 }
@@ -134,7 +135,7 @@ impl<S: Scalar> Sums<S> {
                 let all = W::sum(W::row(&rows[parent]), below);
                 W::put_row(all, &mut rows[parent]);
                 if NINTH {
-                    self.ninths[parent] += below_ninth;
+                    self.ninths[parent][0] += below_ninth;
                 }
             }
         }

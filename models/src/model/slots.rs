@@ -19,7 +19,8 @@ pub(crate) struct Slots {
     pub(crate) parents: Vec<usize>,
     /// The joint of each slot; beyond the last, the slot itself.
     pub(crate) joints: Vec<usize>,
-    /// At which joint the pose of each joint is, and which of its axes that of the joint is.
+    /// At which joint the pose of each joint is, and which of its axes that of the joint is; beyond the last, the joint
+    /// itself.
     pub(crate) lines: Vec<[usize; 2]>,
     /// The link of each slot.
     pub(crate) links: Vec<usize>,
@@ -68,8 +69,10 @@ impl Slots {
             JointKind::Ball(axis) => [joint.last_axis(i), axis],
             _ => [i, 2],
         };
+        let mut lines: Vec<_> = joints.iter().enumerate().map(line).collect();
+        lines.extend((joints.len()..joints.len().next_multiple_of(LANES)).map(|i| [i, 2]));
         Self {
-            lines: joints.iter().enumerate().map(line).collect(),
+            lines,
             parents: order[..links].iter().map(|joint| above(*joint)).collect(),
             links: padded(by_slot(&link), &|_| 0),
             carriers: padded(by_slot(&carrier), &|_| nothing),

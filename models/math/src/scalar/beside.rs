@@ -19,6 +19,9 @@ pub trait Wide<S: Scalar>: Scalar {
     fn store(self, several: &mut S::Several);
     /// Constants: all eight, or the one in a lane.
     fn constants(eight: &Block, lane: usize) -> Self;
+    /// Of numbers that lie apart, by lane. What was written number by number is not read as a whole: that would wait for
+    /// its way through the cache.
+    fn each(of: impl Fn(usize) -> S) -> Self;
     /// The same number everywhere.
     fn of_one(number: &S) -> Self;
     /// A row in registers.
@@ -112,6 +115,10 @@ macro_rules! alone {
             #[inline(always)]
             fn constants(eight: &Block, lane: usize) -> Self {
                 Self::constant(eight.0[lane])
+            }
+            #[inline(always)]
+            fn each(of: impl Fn(usize) -> Self) -> Self {
+                of(0)
             }
             #[inline(always)]
             fn of_one(number: &Self) -> Self {
@@ -298,6 +305,10 @@ impl<E: Eight, L: Eight> Wide<f64> for Sides<E, L> {
         Self::new(E::of(eight))
     }
     #[inline(always)]
+    fn each(of: impl Fn(usize) -> f64) -> Self {
+        Self::new(E::of_numbers([of(0), of(1), of(2), of(3), of(4), of(5), of(6), of(7)]))
+    }
+    #[inline(always)]
     fn of_one(number: &f64) -> Self {
         Self::new(E::all(*number))
     }
@@ -434,6 +445,10 @@ impl<E: Eight, L: Eight, const N: usize> Wide<LanesOf<N>> for Sides<E, L> {
     #[inline(always)]
     fn constants(eight: &Block, lane: usize) -> Self {
         Self::constant(eight.0[lane])
+    }
+    #[inline(always)]
+    fn each(of: impl Fn(usize) -> LanesOf<N>) -> Self {
+        Self::of_plants(&of(0))
     }
     #[inline(always)]
     fn of_one(number: &LanesOf<N>) -> Self {

@@ -66,7 +66,7 @@ impl<const N: usize, const K: usize> Row<N, K> {
         self.joints.place_here(joints);
         let (elimination, inertia) = (&model.elimination, &model.conditioning.inertia[..K]);
         for below in 0..K {
-            let first = elimination.row(below).start;
+            let first = elimination.start(below);
             for above in 0..=below {
                 self.joints.fill_entry(joints, [above, below], h, (matrix, first + above));
             }
@@ -228,7 +228,7 @@ impl<const N: usize> Abreast<N> {
             if !LanesOf::<N>::any(live) {
                 break;
             }
-            matrix.substitute(&model.elimination, &mut r);
+            matrix.substitute::<true>(&model.elimination, &mut r);
             for i in 0..K {
                 x[i] -= r[i];
             }

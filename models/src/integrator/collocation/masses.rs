@@ -80,7 +80,7 @@ impl<const N: usize> Masses<N> {
             let inverse = self.inverse.as_chunks_mut::<GROUPS>().0;
             for k in (0..elimination.rows()).rev() {
                 let ancestors = elimination.above(k);
-                let (above, row) = entries.split_at_mut(elimination.row(k).start);
+                let (above, row) = entries.split_at_mut(elimination.start(k));
                 let depth = ancestors.len();
                 inverse[k] = row[depth].map(Scalar::recip);
                 for (d, &ancestor) in ancestors.iter().enumerate().rev() {
@@ -88,7 +88,7 @@ impl<const N: usize> Masses<N> {
                     for (factor, inverse) in factor.iter_mut().zip(inverse[k]) {
                         *factor = *factor * inverse;
                     }
-                    let target = &mut above[elimination.row(ancestor).start..][..=d];
+                    let target = &mut above[elimination.start(ancestor)..][..=d];
                     for (target, own) in target.iter_mut().zip(&row[..=d]) {
                         for g in 0..GROUPS {
                             target[g] -= factor[g] * own[g];
