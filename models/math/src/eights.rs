@@ -28,8 +28,10 @@ pub const UNITS: [Block; LANES] = {
 pub trait Eight: Copy + 'static {
     /// The same, of which the first four are of use.
     type Four: Eight;
-    /// Whether the first of them alone is of use.
-    const IS_ALONE: bool = false;
+    /// As many as are in one register.
+    type One: Eight;
+    /// How many are of use.
+    const COUNT: usize = LANES;
     /// Zeros.
     const ZERO: Self;
     /// Ones.
@@ -154,6 +156,7 @@ pub fn in_eights<T: InEights>(task: T) -> T::Output {
 
 impl Eight for Block {
     type Four = Self;
+    type One = Self;
     const ZERO: Self = Self([0.0; 8]);
     const ONE: Self = Self([1.0; 8]);
     #[inline(always)]
@@ -217,7 +220,8 @@ impl Eight for Block {
 /// The first of eight numbers alone, where the others are of no use.
 impl Eight for f64 {
     type Four = Self;
-    const IS_ALONE: bool = true;
+    type One = Self;
+    const COUNT: usize = 1;
     const ZERO: Self = 0.0;
     const ONE: Self = 1.0;
     #[inline(always)]

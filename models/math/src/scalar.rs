@@ -64,10 +64,6 @@ macro_rules! nothing_beside {
         type Row = [Self; 8];
         const BESIDE: usize = 1;
         #[inline(always)]
-        fn several(of: impl Fn(usize) -> Self) -> Self {
-            of(0)
-        }
-        #[inline(always)]
         fn one(several: &Self, _: usize) -> Self {
             *several
         }
@@ -156,8 +152,6 @@ pub trait Scalar:
     const BESIDE: usize;
     /// Eight numbers that belong together, in memory.
     type Row: Copy + Default + Debug;
-    /// Numbers side by side.
-    fn several(of: impl Fn(usize) -> Self) -> Self::Several;
     /// One of them.
     fn one(several: &Self::Several, lane: usize) -> Self;
     /// Replaces one of them.
@@ -197,14 +191,6 @@ impl Scalar for f64 {
     type Several = Block;
     type Row = Block;
     const BESIDE: usize = 8;
-    #[inline(always)]
-    fn several(of: impl Fn(usize) -> Self) -> Block {
-        let mut several = Block::ZERO;
-        for (lane, number) in several.0.iter_mut().enumerate() {
-            *number = of(lane);
-        }
-        several
-    }
     #[inline(always)]
     fn one(several: &Block, lane: usize) -> Self {
         several.0[lane]

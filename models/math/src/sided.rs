@@ -1,6 +1,6 @@
 //! Lists of vectors that lie side by side: the first numbers of several of them, then their second ones.
 //!
-//! What is computed alike for all entries of a list is computed for [`Scalar::BESIDE`] of them at once; what goes
+//! What is computed alike for all entries of a list is computed for [`Wide::COUNT`] of them at once; what goes
 //! from one to the next, such as sums along a tree, takes and puts them one by one.
 
 use crate::scalar::{Scalar, Wide};
@@ -98,7 +98,9 @@ impl<V: Copy + Default> Sided<V> {
     {
         Self(vec![V::default(); count.div_ceil(S::BESIDE)])
     }
+}
 
+impl<V: Copy> Sided<V> {
     /// One of them.
     #[inline(always)]
     pub fn get<S: Scalar>(&self, i: usize) -> V::Of<S>
@@ -114,7 +116,7 @@ impl<V: Copy + Default> Sided<V> {
     where
         V: Composite<S::Several>,
     {
-        self.0[i / S::BESIDE].map(|several| W::load(several))
+        self.0[i / S::BESIDE].map(|several| W::load(several, i % S::BESIDE))
     }
 
     /// Replaces several, the first of which is `i`.
@@ -123,7 +125,7 @@ impl<V: Copy + Default> Sided<V> {
     where
         V: Composite<S::Several>,
     {
-        self.0[i / S::BESIDE].zip(wide, |several, wide: W| wide.store(several));
+        self.0[i / S::BESIDE].zip(wide, |several, wide: W| wide.store(several, i % S::BESIDE));
     }
 
     /// Replaces one of them.

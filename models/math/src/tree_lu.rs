@@ -90,9 +90,13 @@ impl<S: Compared, const IN_A_ROW: bool> Beside<S> for Factor<'_, S, IN_A_ROW> {
                 let start = starts[ancestor];
                 let (upper_above, lower_above) =
                     (&mut upper_above[start..], &mut lower_above[start..]);
-                let [above, own] = [d, d + 1].map(width);
-                W::subtract(l, &upper_row[..own], &mut upper_above[..own]);
-                W::subtract(u, &lower_row[..above], &mut lower_above[..above]);
+                let own = width(d + 1);
+                let above = if W::TAKES_FOURS { own } else { d };
+                W::subtract(
+                    [l, u],
+                    [&upper_row[..own], &lower_row[..above]],
+                    [&mut upper_above[..own], &mut lower_above[..above]],
+                );
             }
         }
         smallest

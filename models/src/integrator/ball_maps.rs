@@ -1,4 +1,6 @@
-//! The maps of all ball joints of a step, eight side by side.
+//! The maps of all ball joints of a step, four or eight side by side.
+
+use std::ops::Range;
 
 use plantd_math::rotation::{Chart, Quaternion, Turn};
 use plantd_math::rows::Block;
@@ -8,7 +10,7 @@ use plantd_math::spatial::{Mat3, Vec3};
 
 use crate::lagrangian::turning::Weights;
 
-/// As many ball joints stand side by side.
+/// As many ball joints stand side by side, at most.
 const BESIDE: usize = <f64 as Scalar>::BESIDE;
 
 /// Does it for all of so many ball joints. A floating base has one: side by side with nothing it would take longer.
@@ -16,16 +18,16 @@ pub(crate) fn beside<T: Beside<f64>>(count: usize, task: T) -> T::Output {
     if count == 1 { f64::alone(task) } else { f64::beside(count, task) }
 }
 
-/// In registers.
+/// Those that are computed at once, of so many.
 #[inline(always)]
-fn wide<W: Wide<f64>, V: Composite<Block>>(lanes: &V) -> V::Of<W> {
-    lanes.map(|number| W::load(number))
+fn groups<W: Wide<f64>>(count: usize) -> impl Iterator<Item = Range<usize>> {
+    (0..count).step_by(W::COUNT).map(move |first| first..count.min(first + W::COUNT))
 }
 
 /// In memory.
 #[inline(always)]
 fn put<W: Wide<f64>, V: Composite<Block>>(wide: V::Of<W>, lanes: &mut V) {
-    lanes.zip(wide, |to, number| number.store(to));
+    lanes.zip(wide, |to, number| number.store(to, 0));
 }
 
 /// Gives the matrices of so many ball joints, one after the other.
@@ -41,24 +43,24 @@ fn each<W: Wide<f64>>(wide: &Mat3<W>, count: usize, mut take: impl FnMut(usize, 
     }
 }
 
-/// Components of a list, by their first coordinates. Where it does not reach, as of what is prescribed, they are others.
+/// Components of a list, by their first coordinates. Where it does not reach, as of what is prescribed, they are others,
+/// by lane.
 #[inline(always)]
-fn collect<W: Wide<f64>>(coordinates: &[usize], list: &[f64], others: Vec3<Block>) -> Vec3<W> {
-    let numbers = |i: usize| list.get(i..i + 3);
-    if let [one] = coordinates {
-        // Nothing to be put together.
-        return match numbers(*one) {
-            Some(numbers) => Vec3(one_of([numbers[0], numbers[1], numbers[2]])),
-            None => wide::<W, _>(&others),
+fn collect<W: Wide<f64>>(
+    coordinates: &[usize],
+    list: &[f64],
+    others: impl Fn(usize) -> Vec3,
+) -> Vec3<W> {
+    let mut threes = [[0.0; 3]; BESIDE];
+    for (lane, (three, &i)) in threes.iter_mut().zip(coordinates).enumerate() {
+        *three = match list.get(i..i + 3) {
+            Some(numbers) => [numbers[0], numbers[1], numbers[2]],
+            None => others(lane).0,
         };
     }
-    let Vec3([Block(x), Block(y), Block(z)]) = others;
-    let mut threes = [[0.0; 3]; BESIDE];
-    for (lane, three) in threes.iter_mut().enumerate() {
-        *three = [x[lane], y[lane], z[lane]];
-        if let Some(numbers) = coordinates.get(lane).and_then(|i| numbers(*i)) {
-            three.copy_from_slice(numbers);
-        }
+    if coordinates.len() == 1 {
+        // Nothing to be put together.
+        return Vec3(one_of(threes[0]));
     }
     let component = |k: usize| W::each(|lane| threes[lane][k]);
     Vec3([component(0), component(1), component(2)])
@@ -103,7 +105,7 @@ fn fours<W: Wide<f64>, T>(list: &[T], of: impl Fn(&T) -> [f64; 4]) -> [W; 4] {
 fn in_memory<W: Wide<f64>>(numbers: [W; 4]) -> [Block; 4] {
     let mut lanes = [Block::ZERO; 4];
     for (to, number) in lanes.iter_mut().zip(numbers) {
-        number.store(to);
+        number.store(to, 0);
     }
     lanes
 }
@@ -121,11 +123,11 @@ impl Beside<f64> for ToMatrices<'_> {
     #[inline(always)]
     fn run<W: Wide<f64>>(self) {
         let Self { orientations, matrices, beside } = self;
-        let ends = matrices.chunks_mut(BESIDE).zip(&mut beside.0);
-        for (orientations, (matrices, beside)) in orientations.chunks(BESIDE).zip(ends) {
-            let orientation = Quaternion(fours::<W, _>(orientations, |q| q.0));
+        for range in groups::<W>(orientations.len()) {
+            let (first, matrices) = (range.start, &mut matrices[range.clone()]);
+            let orientation = Quaternion(fours::<W, _>(&orientations[range], |q| q.0));
             let all = orientation.matrix();
-            put(all, beside);
+            beside.store::<f64, W>(first, all);
             each(&all, matrices.len(), |lane, matrix| matrices[lane] = matrix);
         }
     }
@@ -147,12 +149,12 @@ impl Beside<f64> for ToMidpoint<'_> {
     #[inline(always)]
     fn run<W: Wide<f64>>(self) {
         let Self { coordinates, increment, start, turns, middle } = self;
-        let ends = start.0.iter().zip(middle.chunks_mut(BESIDE));
-        let groups = coordinates.chunks(BESIDE).zip(&mut turns.0);
-        for ((coordinates, turn), (start, middle)) in groups.zip(ends) {
-            let own = Turn::new(collect::<W>(coordinates, increment, turn.xi));
-            put(own, turn);
-            let all = wide::<W, _>(start).times(&own.half());
+        for range in groups::<W>(coordinates.len()) {
+            let (first, middle) = (range.start, &mut middle[range.clone()]);
+            let before = |lane: usize| turns.get::<f64>(first + lane).xi;
+            let own = Turn::new(collect::<W>(&coordinates[range], increment, before));
+            turns.store::<f64, W>(first, own);
+            let all = start.wide::<f64, W>(first).times(&own.half());
             each(&all, middle.len(), |lane, matrix| middle[lane] = matrix);
         }
     }
@@ -178,12 +180,12 @@ impl Beside<f64> for CarryOn<'_> {
     #[inline(always)]
     fn run<W: Wide<f64>>(self) {
         let Self { coordinates, places, turns, momenta: [p, low], total, carried } = self;
-        let groups = coordinates.chunks(BESIDE).zip(places.chunks(BESIDE));
-        for ((coordinates, places), turn) in groups.zip(&turns.0) {
-            let turn: Turn<W> = wide::<W, _>(turn);
-            let p = collect(coordinates, p, Vec3::default());
-            let low = collect(coordinates, low, Vec3::default());
-            let total = collect(places, total, Vec3::default());
+        for range in groups::<W>(coordinates.len()) {
+            let turn: Turn<W> = turns.wide::<f64, W>(range.start);
+            let (coordinates, places) = (&coordinates[range.clone()], &places[range]);
+            let p = collect(coordinates, p, |_| Vec3::ZERO);
+            let low = collect(coordinates, low, |_| Vec3::ZERO);
+            let total = collect(places, total, |_| Vec3::ZERO);
             let start = turn.torque_to_start(total).scaled(0.5) + low + p;
             let mut lanes = Vec3::default();
             put(Chart::new(turn.xi).dexp().apply(start), &mut lanes);
@@ -211,10 +213,10 @@ impl Beside<f64> for Weigh<'_> {
     #[inline(always)]
     fn run<W: Wide<f64>>(self) {
         let Self { coordinates, turns, momentum, torque, force, half, weight, weights } = self;
-        let groups = coordinates.chunks(BESIDE).zip(&turns.0);
-        for ((coordinates, turn), weights) in groups.zip(weights.chunks_mut(BESIDE)) {
-            let turn: Turn<W> = wide::<W, _>(turn);
-            let of = |list: &[f64]| collect::<W>(coordinates, list, Vec3::default());
+        for range in groups::<W>(coordinates.len()) {
+            let turn: Turn<W> = turns.wide::<f64, W>(range.start);
+            let (coordinates, weights) = (&coordinates[range.clone()], &mut weights[range]);
+            let of = |list: &[f64]| collect::<W>(coordinates, list, |_| Vec3::ZERO);
             let (momentum, torque, force) = (of(momentum), of(torque), of(force));
             let changes = turn.changes();
             let impulse = torque.scaled(half) + force.scaled(weight);
@@ -245,9 +247,10 @@ impl Beside<f64> for TurnOn<'_> {
     #[inline(always)]
     fn run<W: Wide<f64>>(self) {
         let Self { coordinates, increment, orientations, low, q } = self;
-        let ends = orientations.chunks_mut(BESIDE).zip(low.chunks_mut(BESIDE));
-        for (coordinates, (orientations, low)) in coordinates.chunks(BESIDE).zip(ends) {
-            let turn = collect::<W>(coordinates, increment, Vec3::default());
+        for range in groups::<W>(coordinates.len()) {
+            let (orientations, low) = (&mut orientations[range.clone()], &mut low[range.clone()]);
+            let coordinates = &coordinates[range];
+            let turn = collect::<W>(coordinates, increment, |_| Vec3::ZERO);
             let start = Quaternion(fours::<W, _>(orientations, |q| q.0));
             let (end, end_low) = start.turned(fours::<W, _>(low, |low| *low), turn);
             let mut vectors = Vec3::<Block>::default();

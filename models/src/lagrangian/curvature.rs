@@ -134,7 +134,7 @@ fn put_rows<S: Scalar, W: Wide<S>, const BALLS: bool>(
     if BALLS {
         W::spread_to(numbers, rows, joints);
     } else {
-        W::spread(numbers, &mut rows[joints[0]..joints[0] + S::BESIDE]);
+        W::spread(numbers, &mut rows[joints[0]..joints[0] + W::COUNT]);
     }
 }
 
@@ -173,11 +173,11 @@ impl<S: Scalar> Curvature<S> {
         momenta: &Momenta<S>,
     ) {
         let slots = &tree.slots;
-        for i in firsts_of_links::<S>(tree) {
+        for i in firsts_of_links::<S, W>(tree) {
             self.place::<W, BALLS>(tree, poses, momenta, i);
         }
         self.tensors.ascend::<W, false>(&slots.parents);
-        for i in firsts::<S>(tree) {
+        for i in firsts::<S, W>(tree) {
             let (axis, rate) = (momenta.axis.wide::<S, W>(i), momenta.axis_rate.wide::<S, W>(i));
             let [xx, yy, zz, xy, xz, yz, ..] = self.tensors.take_from::<W, BALLS>(i, &slots.links);
             let composite = Inertia {
@@ -192,7 +192,7 @@ impl<S: Scalar> Curvature<S> {
             let [e1, e2] = horizontal.map(Vec3::<W>::lift);
             let tilt = [axis.w.dot(e1), axis.w.dot(e2)];
             let weight = [force.f.dot(e2) * gravity, -force.f.dot(e1) * gravity];
-            let joints = &slots.joints[i..i + S::BESIDE];
+            let joints = &slots.joints[i..i + W::COUNT];
             let axis = row(axis.w, axis.v, [W::ZERO; 2]);
             let rate = row(rate.w, rate.v, tilt);
             put_rows::<S, W, BALLS>(&mut self.axis, joints, axis);

@@ -80,13 +80,11 @@ fn moving<S: Scalar, W: Wide<S>>([x, y, z]: &[W::Triple; 3], v: &Vec3<S>) -> W::
 impl<S: Scalar> Poses<S> {
     pub(crate) fn new(tree: &Tree) -> Self {
         let n = tree.joints.len();
-        // Beyond the last joint as many as lie beside it.
-        let padded = n.next_multiple_of(S::BESIDE);
         let hinges = tree.joints.iter().filter(|joint| joint.kind.turns_about_axis()).count();
         let turns = if S::BESIDE > 1 { hinges.next_multiple_of(4) } else { hinges };
         Self {
-            rotation: vec![Mat3::IDENTITY; padded],
-            position: vec![Vec3::ZERO; padded],
+            rotation: vec![Mat3::IDENTITY; n],
+            position: vec![Vec3::ZERO; n],
             origin: vec![Vec3::ZERO; n],
             sides: Sided::zeros::<S>(if S::BESIDE > 1 { n } else { 0 }),
             edge: vec![Vec3::ZERO; n],
@@ -142,41 +140,25 @@ impl<S: Scalar> Poses<S> {
         Pose { x, y, z, at: self.position[joint] }
     }
 
-    /// Lays the poses of joints side by side, by slot; `OTHER`: some joint may be a ball joint.
+    /// Puts the pose of a joint, at its last axis, into its slots; `OTHER`: it may be a ball joint.
     #[inline(always)]
-    fn lay_beside<W: Wide<S>, const OTHER: bool>(&mut self, tree: &Tree) {
+    fn put_beside<const OTHER: bool>(&mut self, tree: &Tree, joint: usize) {
         if S::BESIDE == 1 {
             return;
         }
-        for i in (0..tree.joints.len()).step_by(S::BESIDE) {
-            let mut axes = [(&self.rotation[0], &self.rotation[0].0[2], &self.position[0]); 8];
-            for (lane, (own, z, place)) in axes.iter_mut().enumerate() {
-                let [at, axis] = match OTHER {
-                    true => tree.slots.lines[tree.slots.joints[i + lane]],
-                    false => [i + lane, 2],
-                };
-                (*own, *place) = (&self.rotation[at], &self.position[at]);
-                *z = &own.0[axis];
+        let pose = self.pose(joint);
+        if !OTHER {
+            return self.sides.put::<S>(joint, pose);
+        }
+        self.sides.put::<S>(tree.slots.of(joint), pose);
+        if let JointKind::Ball(_) = tree.joints[joint].kind {
+            for (axis, z) in [pose.x, pose.y].into_iter().enumerate() {
+                let slot = tree.slots.of(joint - 2 + axis);
+                let (sides, lane) = (&mut self.sides.0[slot / S::BESIDE], slot % S::BESIDE);
+                let put = |several: &mut S::Several, number: S| number.put(several, lane);
+                sides.z.zip(z, put);
+                sides.at.zip(pose.at, put);
             }
-            let column = |k: usize| {
-                Vec3([
-                    W::each(|lane| axes[lane].0.0[k][0]),
-                    W::each(|lane| axes[lane].0.0[k][1]),
-                    W::each(|lane| axes[lane].0.0[k][2]),
-                ])
-            };
-            let (x, y) = (column(0), column(1));
-            let z = Vec3([
-                W::each(|lane| axes[lane].1[0]),
-                W::each(|lane| axes[lane].1[1]),
-                W::each(|lane| axes[lane].1[2]),
-            ]);
-            let at = Vec3([
-                W::each(|lane| axes[lane].2[0]),
-                W::each(|lane| axes[lane].2[1]),
-                W::each(|lane| axes[lane].2[2]),
-            ]);
-            self.sides.store::<S, W>(i, Pose { x, y, z, at });
         }
     }
 
@@ -255,14 +237,13 @@ impl<S: Scalar> Poses<S> {
             let own = if OTHER { joint.last_axis(i) } else { i };
             W::put_triple(edge, &mut self.edge[own].0);
             let position = W::triple_sum(position, edge);
-            last_position = self.set_aside::<W>(tree, own, last, position);
+            last_position = self.set_aside::<W, OTHER>(tree, own, last, position);
         }
-        self.lay_beside::<W, OTHER>(tree);
     }
 
     /// Takes note of the pose of a joint; returns its position, from the origin that counts from now on.
     #[inline(always)]
-    fn set_aside<W: Wide<S>>(
+    fn set_aside<W: Wide<S>, const OTHER: bool>(
         &mut self,
         tree: &Tree,
         joint: usize,
@@ -277,6 +258,7 @@ impl<S: Scalar> Poses<S> {
             self.move_origin(tree, joint);
             position = W::triple(&[S::ZERO; 3]);
         }
+        self.put_beside::<OTHER>(tree, joint);
         position
     }
 
@@ -291,6 +273,7 @@ impl<S: Scalar> Poses<S> {
                 return;
             }
             self.position[parent] = self.position[i] - self.edge[i];
+            self.put_beside::<true>(tree, parent);
             i = parent;
         }
     }

@@ -63,7 +63,7 @@ impl<S: Scalar> Beside<S> for Gradient<'_, S> {
         if l_v.is_empty() {
             return;
         }
-        for i in firsts::<S>(tree) {
+        for i in firsts::<S, W>(tree) {
             let (axis, momentum) = (momenta.axis.wide::<S, W>(i), momenta.momentum.wide::<S, W>(i));
             let mut torque = momenta.axis_rate.wide::<S, W>(i).dot(momentum);
             if let Some(g) = gravity {
@@ -81,10 +81,10 @@ impl<S: Scalar> Beside<S> for Gradient<'_, S> {
 #[inline(always)]
 fn collect<S: Scalar, W: Wide<S>>(slots: &Slots, i: usize, list: &[S]) -> W {
     if !slots.are_in_order {
-        return collect_of(&slots.coordinates[0][i..i + S::BESIDE], list);
+        return collect_of(&slots.coordinates[0][i..i + W::COUNT], list);
     }
-    match list.get(i..i + S::BESIDE) {
-        Some(numbers) => W::load(&S::several(|lane| numbers[lane])),
+    match list.get(i..i + W::COUNT) {
+        Some(numbers) => W::first_of(numbers),
         None => W::each(|lane| list.get(i + lane).copied().unwrap_or(S::ZERO)),
     }
 }
@@ -99,14 +99,14 @@ fn collect_of<S: Scalar, W: Wide<S>>(coordinates: &[usize], list: &[S]) -> W {
 #[inline(always)]
 fn scatter<S: Scalar, W: Wide<S>>(slots: &Slots, i: usize, wide: W, list: &mut [S]) {
     let mut several = S::Several::default();
-    wide.store(&mut several);
+    wide.store(&mut several, 0);
     if slots.are_in_order {
-        for (lane, number) in list.iter_mut().skip(i).take(S::BESIDE).enumerate() {
+        for (lane, number) in list.iter_mut().skip(i).take(W::COUNT).enumerate() {
             *number = S::one(&several, lane);
         }
         return;
     }
-    for (lane, coordinate) in slots.coordinates[0][i..i + S::BESIDE].iter().enumerate() {
+    for (lane, coordinate) in slots.coordinates[0][i..i + W::COUNT].iter().enumerate() {
         if let Some(number) = list.get_mut(*coordinate) {
             *number = S::one(&several, lane);
         }
@@ -152,7 +152,7 @@ fn own_twist<S: Scalar, W: Wide<S>, const BALLS: bool>(
     if !BALLS || (S::BESIDE == 1 && !slots.is_ball(i)) {
         return own;
     }
-    let ([_, first, second], lanes) = (&slots.coordinates, i..i + S::BESIDE);
+    let ([_, first, second], lanes) = (&slots.coordinates, i..i + W::COUNT);
     let first: W = collect_of(&first[lanes.clone()], velocity);
     let second: W = collect_of(&second[lanes], velocity);
     let turn = pose.x * first + pose.y * second;
@@ -232,7 +232,7 @@ impl<S: Scalar> Momenta<S> {
             return self.one_by_one::<W, BALLS>(tree, poses, velocity);
         }
         let slots = &tree.slots;
-        for i in firsts::<S>(tree) {
+        for i in firsts::<S, W>(tree) {
             let pose = poses.wide::<W, BALLS>(tree, i);
             let axis = axis_at::<S, W>(tree, &pose, i);
             self.axis.store::<S, W>(i, axis);
@@ -243,11 +243,11 @@ impl<S: Scalar> Momenta<S> {
             }
         }
         self.sums.descend::<W>(&slots.parents);
-        for i in firsts::<S>(tree).filter(|_| BALLS) {
+        for i in firsts::<S, W>(tree).filter(|_| BALLS) {
             let carrier = motion(self.sums.take_from::<W, BALLS>(i, &slots.carriers));
             self.axis_rate.store::<S, W>(i, carrier.cross(self.axis.wide::<S, W>(i)));
         }
-        for i in firsts_of_links::<S>(tree) {
+        for i in firsts_of_links::<S, W>(tree) {
             let twist = motion(self.sums.take(i));
             if !BALLS {
                 // What an axis adds to the twist does not move it.
@@ -257,7 +257,7 @@ impl<S: Scalar> Momenta<S> {
             self.sums.put_vectors(i, own);
         }
         self.sums.ascend::<W, true>(&slots.parents);
-        for i in firsts::<S>(tree) {
+        for i in firsts::<S, W>(tree) {
             let [n, f, moment] = self.sums.take_vectors_from::<W, BALLS>(i, &slots.links);
             self.momentum.store::<S, W>(i, Force { n, f });
             self.moment.store::<S, W>(i, moment);

@@ -14,34 +14,37 @@ use crate::model::tree::{Tree, WORLD};
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Sums<S: Scalar> {
     rows: Vec<S::Row>,
-    /// Apart, as they are written one by one: what is read as a whole after that waits.
-    ninths: Vec<[S; 2]>,
+    ninths: Vec<S>,
 }
 
 /// Where slots begin that are side by side.
 #[inline(always)]
-pub(crate) fn firsts<S: Scalar>(tree: &Tree) -> impl Iterator<Item = usize> + use<S> {
-    (0..tree.joints.len()).step_by(S::BESIDE)
+pub(crate) fn firsts<S: Scalar, W: Wide<S>>(
+    tree: &Tree,
+) -> impl Iterator<Item = usize> + use<S, W> {
+    (0..tree.joints.len()).step_by(W::COUNT)
 }
 
 /// The same of those that begin with a link.
 #[inline(always)]
-pub(crate) fn firsts_of_links<S: Scalar>(tree: &Tree) -> impl Iterator<Item = usize> + use<S> {
-    (0..tree.slots.parents.len()).step_by(S::BESIDE)
+pub(crate) fn firsts_of_links<S: Scalar, W: Wide<S>>(
+    tree: &Tree,
+) -> impl Iterator<Item = usize> + use<S, W> {
+    (0..tree.slots.parents.len()).step_by(W::COUNT)
 }
 
 impl<S: Scalar> Sums<S> {
     pub(crate) fn new(slots: &Slots) -> Self {
         Self {
             rows: vec![S::Row::default(); slots.nothing() + 1],
-            ninths: vec![[S::ZERO; 2]; slots.nothing()],
+            ninths: vec![S::ZERO; slots.nothing()],
         }
     }
 
     /// Sets the first eight numbers of the links that begin with `i`.
     #[inline(always)]
     pub(crate) fn put<W: Wide<S>>(&mut self, i: usize, numbers: [W; 8]) {
-        W::spread(numbers, &mut self.rows[i..i + S::BESIDE]);
+        W::spread(numbers, &mut self.rows[i..i + W::COUNT]);
     }
 
     /// Sets all nine, of three vectors.
@@ -49,8 +52,8 @@ impl<S: Scalar> Sums<S> {
     pub(crate) fn put_vectors<W: Wide<S>>(&mut self, i: usize, [a, b, c]: [Vec3<W>; 3]) {
         self.put(i, [a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1]]);
         let mut several = S::Several::default();
-        c[2].store(&mut several);
-        for (lane, [ninth, _]) in self.ninths[i..i + S::BESIDE].iter_mut().enumerate() {
+        c[2].store(&mut several, 0);
+        for (lane, ninth) in self.ninths[i..i + W::COUNT].iter_mut().enumerate() {
             *ninth = S::one(&several, lane);
         }
     }
@@ -58,7 +61,7 @@ impl<S: Scalar> Sums<S> {
     /// The first eight sums of the links that begin with `i`.
     #[inline(always)]
     pub(crate) fn take<W: Wide<S>>(&self, i: usize) -> [W; 8] {
-        W::collect(&self.rows[i..i + S::BESIDE])
+        W::collect(&self.rows[i..i + W::COUNT])
     }
 
     /// The same of the links that belong to the slots from `i` on; without ball joints they are the slots.
@@ -69,7 +72,7 @@ impl<S: Scalar> Sums<S> {
         links: &[usize],
     ) -> [W; 8] {
         match BALLS {
-            true => W::collect_from(&self.rows, &links[i..i + S::BESIDE]),
+            true => W::collect_from(&self.rows, &links[i..i + W::COUNT]),
             false => self.take(i),
         }
     }
@@ -83,11 +86,10 @@ impl<S: Scalar> Sums<S> {
     ) -> [Vec3<W>; 3] {
         let [p, q, r, s, t, u, x, y] = self.take_from::<W, BALLS>(i, links);
         let z = if BALLS {
-            let links = &links[i..i + S::BESIDE];
-            W::each(|lane| self.ninths[links[lane]][0])
+            let links = &links[i..i + W::COUNT];
+            W::each(|lane| self.ninths[links[lane]])
         } else {
-            let ninths = &self.ninths[i..i + S::BESIDE];
-            W::each(|lane| ninths[lane][0])
+            W::first_of(&self.ninths[i..i + W::COUNT])
         };
         [Vec3([p, q, r]), Vec3([s, t, u]), Vec3([x, y, z])]
     }
@@ -124,7 +126,7 @@ impl<S: Scalar> Sums<S> {
             }
             below = sum;
             if NINTH {
-                let [sum, _] = &mut self.ninths[i];
+                let sum = &mut self.ninths[i];
                 if is_followed {
                     *sum += below_ninth;
                 }
@@ -135,7 +137,7 @@ impl<S: Scalar> Sums<S> {
                 let all = W::sum(W::row(&rows[parent]), below);
                 W::put_row(all, &mut rows[parent]);
                 if NINTH {
-                    self.ninths[parent][0] += below_ninth;
+                    self.ninths[parent] += below_ninth;
                 }
             }
         }

@@ -19,8 +19,7 @@ pub(crate) struct Slots {
     pub(crate) parents: Vec<usize>,
     /// The joint of each slot; beyond the last, the slot itself.
     pub(crate) joints: Vec<usize>,
-    /// At which joint the pose of each joint is, and which of its axes that of the joint is; beyond the last, the joint
-    /// itself.
+    /// At which joint the pose of each joint is, and which of its axes that of the joint is.
     pub(crate) lines: Vec<[usize; 2]>,
     /// The link of each slot.
     pub(crate) links: Vec<usize>,
@@ -69,10 +68,8 @@ impl Slots {
             JointKind::Ball(axis) => [joint.last_axis(i), axis],
             _ => [i, 2],
         };
-        let mut lines: Vec<_> = joints.iter().enumerate().map(line).collect();
-        lines.extend((joints.len()..joints.len().next_multiple_of(LANES)).map(|i| [i, 2]));
         Self {
-            lines,
+            lines: joints.iter().enumerate().map(line).collect(),
             parents: order[..links].iter().map(|joint| above(*joint)).collect(),
             links: padded(by_slot(&link), &|_| 0),
             carriers: padded(by_slot(&carrier), &|_| nothing),

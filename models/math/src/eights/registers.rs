@@ -93,6 +93,7 @@ impl Whole {
 
 impl Eight for Whole {
     type Four = Low;
+    type One = Self;
     #[inline(always)]
     fn of_numbers([a, b, c, d, e, f, g, h]: [f64; 8]) -> Self {
         // SAFETY: there are such registers.
@@ -159,6 +160,8 @@ impl Low {
 
 impl Eight for Low {
     type Four = Self;
+    type One = Self;
+    const COUNT: usize = 4;
     #[inline(always)]
     fn of_numbers([a, b, c, d, ..]: [f64; 8]) -> Self {
         // SAFETY: there are such registers.
@@ -211,6 +214,7 @@ impl Eight for Low {
 
 impl Eight for Halves {
     type Four = Low;
+    type One = Low;
     const ZERO: Self = Self([Low::ZERO; 2]);
     const ONE: Self = Self([Low::ONE; 2]);
     #[inline(always)]

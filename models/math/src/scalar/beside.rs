@@ -8,17 +8,22 @@ use std::marker::PhantomData;
 use std::ops::{Add, AddAssign, Mul, Neg, Sub, SubAssign};
 
 use crate::eights::{Eight, InEights, in_eights};
-use crate::rows::{Block, sum_of_eight};
+use crate::rows::{Block, LANES, sum_of_eight};
 use crate::scalar::{Dual, LanesOf, Scalar, nothing_beside, operators};
+use crate::simd::{AVX512, has};
 
-/// Numbers side by side in registers, of which [`Scalar::Several`] lie in memory.
+/// Numbers side by side in registers. In memory [`Scalar::Several`] lie beside each other: as many, or more.
 pub trait Wide<S: Scalar>: Scalar {
-    /// From memory.
-    fn load(several: &S::Several) -> Self;
+    /// How many.
+    const COUNT: usize = 1;
+    /// From memory, those from a lane on.
+    fn load(several: &S::Several, lane: usize) -> Self;
     /// To memory.
-    fn store(self, several: &mut S::Several);
-    /// Constants: all eight, or the one in a lane.
+    fn store(self, several: &mut S::Several, lane: usize);
+    /// Constants from a lane on.
     fn constants(eight: &Block, lane: usize) -> Self;
+    /// The first numbers of a list.
+    fn first_of(list: &[S]) -> Self;
     /// Of numbers that lie apart, by lane. What was written number by number is not read as a whole: that would wait for
     /// its way through the cache.
     fn each(of: impl Fn(usize) -> S) -> Self;
@@ -38,10 +43,10 @@ pub trait Wide<S: Scalar>: Scalar {
     fn dot_of(a: Self::Line, b: Self::Line) -> S;
     /// The sum of the products of two lines, and of two more.
     fn dots(a: [Self::Line; 2], b: [Self::Line; 2]) -> S;
-    /// Whether [`Wide::subtract`] takes four numbers in one operation.
+    /// Whether [`Wide::subtract`] takes four numbers in one operation: then lists are whole fours, as many in each.
     const TAKES_FOURS: bool = false;
-    /// Subtracts from each number of a list that of another one, times a factor.
-    fn subtract(factor: S, source: &[S], target: &mut [S]);
+    /// Subtracts from each number of two lists that of two others, times a factor each.
+    fn subtract(factors: [S; 2], sources: [&[S]; 2], targets: [&mut [S]; 2]);
     /// Three numbers that belong together.
     type Triple: Copy;
     /// From memory.
@@ -54,7 +59,7 @@ pub trait Wide<S: Scalar>: Scalar {
     fn triple_scaled(triple: Self::Triple, factor: S) -> Self::Triple;
     /// All numbers times a constant.
     fn triple_times(triple: Self::Triple, factor: f64) -> Self::Triple;
-    /// To rows, of which there are [`Scalar::BESIDE`]: each gets one of all eight.
+    /// To rows, of which there are [`Self::COUNT`]: each gets one of all eight.
     fn spread(numbers: [Self; 8], rows: &mut [S::Row]);
     /// The way back.
     fn collect(rows: &[S::Row]) -> [Self; 8];
@@ -78,9 +83,11 @@ macro_rules! alone {
         impl<$($generic)*> Wide<Self> for $type {
             type Line = [Self; 8];
             #[inline(always)]
-            fn subtract(factor: Self, source: &[Self], target: &mut [Self]) {
-                for (t, s) in target.iter_mut().zip(source) {
-                    *t -= factor * *s;
+            fn subtract(factors: [Self; 2], sources: [&[Self]; 2], targets: [&mut [Self]; 2]) {
+                for ((target, source), factor) in targets.into_iter().zip(sources).zip(factors) {
+                    for (t, s) in target.iter_mut().zip(source) {
+                        *t -= factor * *s;
+                    }
                 }
             }
             type Triple = [Self; 3];
@@ -105,12 +112,16 @@ macro_rules! alone {
                 [a * factor, b * factor, c * factor]
             }
             #[inline(always)]
-            fn load(several: &Self) -> Self {
+            fn load(several: &Self, _: usize) -> Self {
                 *several
             }
             #[inline(always)]
-            fn store(self, several: &mut Self) {
+            fn store(self, several: &mut Self, _: usize) {
                 *several = self;
+            }
+            #[inline(always)]
+            fn first_of(list: &[Self]) -> Self {
+                list[0]
             }
             #[inline(always)]
             fn constants(eight: &Block, lane: usize) -> Self {
@@ -189,6 +200,12 @@ impl<E: Eight, L: Eight> Sides<E, L> {
     #[inline(always)]
     fn new(numbers: E) -> Self {
         Self(numbers, PhantomData)
+    }
+
+    /// A lane with which registers begin.
+    #[inline(always)]
+    fn from_lane(lane: usize) -> usize {
+        lane & (LANES - E::COUNT)
     }
 
     #[inline(always)]
@@ -292,38 +309,60 @@ impl<E: Eight, L: Eight> Scalar for Sides<E, L> {
 alone! { [E: Eight, L: Eight] Sides<E, L> }
 
 impl<E: Eight, L: Eight> Wide<f64> for Sides<E, L> {
+    const COUNT: usize = E::COUNT;
     #[inline(always)]
-    fn load(several: &Block) -> Self {
-        Self::new(E::of(several))
+    fn load(several: &Block, lane: usize) -> Self {
+        Self::new(E::of_list(&several.0[Self::from_lane(lane)..]))
     }
     #[inline(always)]
-    fn store(self, several: &mut Block) {
-        self.0.put(several);
+    fn store(self, several: &mut Block, lane: usize) {
+        self.0.put_list(&mut several.0[Self::from_lane(lane)..]);
     }
     #[inline(always)]
-    fn constants(eight: &Block, _: usize) -> Self {
-        Self::new(E::of(eight))
+    fn constants(eight: &Block, lane: usize) -> Self {
+        <Self as Wide<f64>>::load(eight, lane)
+    }
+    #[inline(always)]
+    fn first_of(list: &[f64]) -> Self {
+        Self::new(E::of_list(list))
     }
     #[inline(always)]
     fn each(of: impl Fn(usize) -> f64) -> Self {
-        Self::new(E::of_numbers([of(0), of(1), of(2), of(3), of(4), of(5), of(6), of(7)]))
+        let [a, b, c, d] = match E::COUNT {
+            1 => [of(0); 4],
+            _ => [of(0), of(1), of(2), of(3)],
+        };
+        let [e, f, g, h] = match E::COUNT {
+            LANES => [of(4), of(5), of(6), of(7)],
+            _ => [a; 4],
+        };
+        Self::new(E::of_numbers([a, b, c, d, e, f, g, h]))
     }
     #[inline(always)]
     fn of_one(number: &f64) -> Self {
         Self::new(E::all(*number))
     }
     type Line = L;
-    const TAKES_FOURS: bool = !E::IS_ALONE;
+    const TAKES_FOURS: bool = E::COUNT > 1;
     #[inline(always)]
-    fn subtract(factor: f64, source: &[f64], target: &mut [f64]) {
-        let ((fours, rest), (sources, others)) =
-            (target.as_chunks_mut::<4>(), source.as_chunks::<4>());
-        for (t, s) in fours.iter_mut().zip(sources) {
-            let product = L::Four::of_list(s).scaled(factor);
-            L::Four::of_list(t).minus(product).put_list(t);
+    fn subtract([l, u]: [f64; 2], sources: [&[f64]; 2], targets: [&mut [f64]; 2]) {
+        if !<Self as Wide<f64>>::TAKES_FOURS {
+            for ((target, source), factor) in targets.into_iter().zip(sources).zip([l, u]) {
+                for (t, s) in target.iter_mut().zip(source) {
+                    *t -= factor * *s;
+                }
+            }
+            return;
         }
-        for (t, s) in rest.iter_mut().zip(others) {
-            *t -= factor * *s;
+        let (l, u) = (L::Four::all(l), L::Four::all(u));
+        let ([p, q], [r, s]) = (targets, sources);
+        let first = p.as_chunks_mut::<4>().0.iter_mut().zip(r.as_chunks::<4>().0);
+        let second = q.as_chunks_mut::<4>().0.iter_mut().zip(s.as_chunks::<4>().0);
+        for ((p, r), (q, s)) in first.zip(second) {
+            let product = L::Four::of_list(r).times(l);
+            L::Four::of_list(p).minus(product).put_list(p);
+            let product = L::Four::of_list(s).times(u);
+            L::Four::of_list(q).minus(product).put_list(q);
         }
     }
     type Triple = L::Four;
@@ -404,11 +443,17 @@ fn of_eights<E: Eight, L: Eight>(eights: [E; 8]) -> [Sides<E, L>; 8] {
 impl<E: Eight, L: Eight, const N: usize> Wide<LanesOf<N>> for Sides<E, L> {
     type Line = [Self; 8];
     #[inline(always)]
-    fn subtract(factor: LanesOf<N>, source: &[LanesOf<N>], target: &mut [LanesOf<N>]) {
-        let factor = E::of_list(&factor.0);
-        for (t, s) in target.iter_mut().zip(source) {
-            let product = factor.times(E::of_list(&s.0));
-            E::of_list(&t.0).minus(product).put_list(&mut t.0);
+    fn subtract(
+        factors: [LanesOf<N>; 2],
+        sources: [&[LanesOf<N>]; 2],
+        targets: [&mut [LanesOf<N>]; 2],
+    ) {
+        for ((target, source), factor) in targets.into_iter().zip(sources).zip(factors) {
+            let factor = E::of_list(&factor.0);
+            for (t, s) in target.iter_mut().zip(source) {
+                let product = factor.times(E::of_list(&s.0));
+                E::of_list(&t.0).minus(product).put_list(&mut t.0);
+            }
         }
     }
     type Triple = [Self; 3];
@@ -435,12 +480,16 @@ impl<E: Eight, L: Eight, const N: usize> Wide<LanesOf<N>> for Sides<E, L> {
         <Self as Wide<Self>>::triple_times(triple, factor)
     }
     #[inline(always)]
-    fn load(several: &LanesOf<N>) -> Self {
+    fn load(several: &LanesOf<N>, _: usize) -> Self {
         Self::of_plants(several)
     }
     #[inline(always)]
-    fn store(self, several: &mut LanesOf<N>) {
+    fn store(self, several: &mut LanesOf<N>, _: usize) {
         self.put_plants(several);
+    }
+    #[inline(always)]
+    fn first_of(list: &[LanesOf<N>]) -> Self {
+        Self::of_plants(&list[0])
     }
     #[inline(always)]
     fn constants(eight: &Block, lane: usize) -> Self {
@@ -516,10 +565,11 @@ pub(crate) fn in_plants<T: Beside<LanesOf<N>>, const N: usize>(task: T) -> T::Ou
     }
 }
 
-/// [`Beside`] of reals: of eight, or, where a few are all there are, of four.
+/// [`Beside`] of reals: of eight where there are registers of as many and more than four numbers, else of four. Two
+/// registers for each eight would be more than a processor with AVX2 has at hand.
 #[inline(always)]
 pub(crate) fn in_sides<T: Beside<f64>>(count: usize, task: T) -> T::Output {
-    if count <= FEW {
+    if count <= FEW || !has(AVX512) {
         in_eights(InFour(task, PhantomData))
     } else {
         in_eights(InEight(task, PhantomData))

@@ -1,4 +1,5 @@
-//! All derivatives of a step of a tree in space, eight columns at a time, in whole registers.
+//! All derivatives of a step of a tree in space, as many columns at a time as are in one register: eight numbers of each
+//! stay there from joint to joint, which in two would be more than there are with AVX2.
 //!
 //! The derivatives of the residual and of the momentum at the end of a step have rows and columns of the same
 //! vectors as the Newton matrix ([`generators`](crate::lagrangian::generators)). With what is below a joint and
@@ -29,7 +30,7 @@
 use std::ops::Range;
 
 use plantd_math::eights::{Eight, InEights, UNITS};
-use plantd_math::rows::{Block, LANES};
+use plantd_math::rows::Block;
 
 use crate::kkt::space::lines::Line;
 use crate::kkt::space::margins::{Among, Margins};
@@ -44,7 +45,7 @@ pub(crate) struct Rows<'a> {
     pub(crate) stride: usize,
 }
 
-/// Eight columns of the derivatives; without room until there is need for them.
+/// Columns of the derivatives that are found at once; without room until there is need for them.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Columns<const B: usize> {
     /// `F̂` where limbs meet, zero but within a pass, and `T` there.
@@ -57,7 +58,7 @@ pub(super) struct Columns<const B: usize> {
 /// The unit of a column, where it is one of a block.
 #[inline(always)]
 fn unit<E: Eight>(column: usize, first: usize) -> Option<E> {
-    UNITS.get(column.wrapping_sub(first)).map(|unit| E::of(unit))
+    UNITS[..E::COUNT].get(column.wrapping_sub(first)).map(|unit| E::of(unit))
 }
 
 /// What flows through a joint: for each number of a vector, that of each column.
@@ -163,7 +164,7 @@ impl<const B: usize> Columns<B> {
         let n = axes.len();
         let has = |reach: &Range<usize>, more: usize| {
             reach.start < reach.end
-                && reach.start + more < first + LANES
+                && reach.start + more < first + E::COUNT
                 && first < reach.end + more
         };
         let Limb { groups: own, carries, hangs_from, .. } = limb;
@@ -373,8 +374,8 @@ impl<const B: usize> Lowered<'_, B> {
             for (x, slope) in x.iter().zip(&among.by_increment[a]) {
                 p[a] = p[a].plus(x.scaled(*slope));
             }
-            x[a].put_list(&mut rows.increment[at..][..LANES]);
-            p[a].put_list(&mut rows.momentum[at..][..LANES]);
+            x[a].put_list(&mut rows.increment[at..][..E::COUNT]);
+            p[a].put_list(&mut rows.momentum[at..][..E::COUNT]);
             add(motion, &axes[a].plus, x[a]);
             if let Some(unit) = unit(start + a, first) {
                 add(motion, &margins[a].above, unit);
@@ -397,9 +398,9 @@ impl<const B: usize> InEights for AllColumns<'_, B> {
     #[inline(always)]
     fn run<E: Eight>(self) {
         let Self { recursion, margins, columns, mut rows } = self;
-        for first in (0..2 * recursion.axes.len()).step_by(LANES) {
-            columns.go_up::<E>(recursion, margins, first);
-            columns.go_down::<E>(recursion, margins, first, &mut rows);
+        for first in (0..2 * recursion.axes.len()).step_by(E::One::COUNT) {
+            columns.go_up::<E::One>(recursion, margins, first);
+            columns.go_down::<E::One>(recursion, margins, first, &mut rows);
         }
     }
 }
