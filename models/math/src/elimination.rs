@@ -5,7 +5,6 @@
 //! elimination tree then runs through both. A row stores all its ancestors in the elimination tree,
 //! so one factorization serves every scene.
 
-use std::cmp::Reverse;
 use std::collections::BTreeSet;
 use std::ops::Range;
 
@@ -22,9 +21,6 @@ pub struct SymbolicElimination {
     diagonals: Vec<usize>,
     /// Ancestors of each row, root first, the row itself last, and then some more times.
     ancestors: Vec<usize>,
-    /// Rows as they are eliminated: those with most ancestors first, and of as many the last ones. What one waits for is
-    /// time for others then, which branches by turns have.
-    order: Vec<usize>,
     /// Row `i` owns `descendants[descendant_offsets[i]..descendant_offsets[i + 1]]`.
     descendant_offsets: Vec<usize>,
     /// Proper descendants of each row, and the slots of their entries with it.
@@ -62,10 +58,6 @@ impl SymbolicElimination {
             elimination.ancestors.resize(end.next_multiple_of(TOGETHER), j);
             elimination.offsets.push(elimination.ancestors.len());
         }
-        elimination.order = (0..n).rev().collect();
-        elimination
-            .order
-            .sort_by_key(|row| Reverse(elimination.diagonals[*row] - elimination.offsets[*row]));
         elimination.descendant_offsets = vec![0];
         elimination.coupled_offsets = vec![0];
         for i in 0..n {
@@ -112,20 +104,20 @@ impl SymbolicElimination {
 
     /// Where so many of the first rows begin, and where their diagonals are.
     #[inline(always)]
-    pub(crate) fn places(&self, rows: usize) -> [&[usize]; 2] {
+    pub fn places(&self, rows: usize) -> [&[usize]; 2] {
         [&self.offsets[..rows], &self.diagonals[..rows]]
-    }
-
-    /// Rows as they are eliminated, each before those that are above it.
-    #[inline(always)]
-    pub(crate) fn order(&self) -> &[usize] {
-        &self.order
     }
 
     /// Where a row begins.
     #[inline(always)]
     pub fn start(&self, row: usize) -> usize {
         self.offsets[row]
+    }
+
+    /// Whose entries are in some slots.
+    #[inline(always)]
+    pub(crate) fn ancestors(&self, slots: Range<usize>) -> &[usize] {
+        &self.ancestors[slots]
     }
 
     /// Proper ancestors of a row, root first.

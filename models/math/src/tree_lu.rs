@@ -44,8 +44,8 @@ impl<S: Compared> SmallestPivot<S> {
     }
 }
 
-/// What [`TreeLu::factor`] does; `IN_A_ROW`: each row but the first has the one before for its parent.
-struct Factor<'a, S: Scalar, const IN_A_ROW: bool> {
+/// What [`TreeLu::factor`] does.
+struct Factor<'a, S: Scalar> {
     matrix: &'a mut TreeLu<S>,
     elimination: &'a SymbolicElimination,
     /// One of each row.
@@ -53,7 +53,7 @@ struct Factor<'a, S: Scalar, const IN_A_ROW: bool> {
     factor: f64,
 }
 
-impl<S: Compared, const IN_A_ROW: bool> Beside<S> for Factor<'_, S, IN_A_ROW> {
+impl<S: Compared> Beside<S> for Factor<'_, S> {
     type Output = SmallestPivot<S>;
 
     #[inline(always)]
@@ -72,9 +72,9 @@ impl<S: Compared, const IN_A_ROW: bool> Beside<S> for Factor<'_, S, IN_A_ROW> {
             false => entries,
         };
         let mut smallest = SmallestPivot::NONE;
-        for k in eliminated::<IN_A_ROW>(elimination, rows) {
+        for k in (0..rows).rev() {
             let start = starts[k];
-            let ancestors = elimination.above(k);
+            let ancestors = elimination.ancestors(start..diagonals[k]);
             let depth = ancestors.len();
             let (upper_above, upper_row) = upper.split_at_mut(start);
             let (lower_above, lower_row) = lower.split_at_mut(start);
@@ -101,16 +101,6 @@ impl<S: Compared, const IN_A_ROW: bool> Beside<S> for Factor<'_, S, IN_A_ROW> {
         }
         smallest
     }
-}
-
-/// Rows as they are eliminated.
-#[inline(always)]
-fn eliminated<const IN_A_ROW: bool>(
-    elimination: &SymbolicElimination,
-    rows: usize,
-) -> impl DoubleEndedIterator<Item = usize> {
-    let order = elimination.order();
-    (0..rows).map(move |i| if IN_A_ROW { rows - 1 - i } else { order[i] })
 }
 
 impl<S: Compared> TreeLu<S> {
@@ -161,12 +151,10 @@ impl<S: Compared> TreeLu<S> {
         scale: &[f64],
         factor: f64,
     ) -> SmallestPivot<S> {
-        let task = Factor::<S, false> { matrix: self, elimination, scale, factor };
-        S::beside(scale.len(), task)
+        S::beside(scale.len(), Factor { matrix: self, elimination, scale, factor })
     }
 
-    /// [`Self::factor`] of rows that are one below the other, number by number, in the code of the caller, which may know
-    /// how many there are.
+    /// [`Self::factor`] number by number, in the code of the caller, which may know how many rows there are.
     #[inline(always)]
     pub fn factor_few(
         &mut self,
@@ -174,30 +162,31 @@ impl<S: Compared> TreeLu<S> {
         scale: &[f64],
         factor: f64,
     ) -> SmallestPivot<S> {
-        S::alone(Factor::<S, true> { matrix: self, elimination, scale, factor })
+        S::alone(Factor { matrix: self, elimination, scale, factor })
     }
 
     /// Solves `K x = b` in place.
     #[inline(never)]
     pub fn solve(&self, elimination: &SymbolicElimination, x: &mut [S]) {
-        self.substitute::<false>(elimination, x);
+        self.substitute(elimination, x);
     }
 
-    /// [`Self::solve`] in the registers of the caller; `IN_A_ROW`: each row but the first has the one before for its
-    /// parent, and the caller may know how many there are.
+    /// [`Self::solve`] in the registers of the caller.
     #[inline(always)]
-    pub fn substitute<const IN_A_ROW: bool>(&self, elimination: &SymbolicElimination, x: &mut [S]) {
+    pub fn substitute(&self, elimination: &SymbolicElimination, x: &mut [S]) {
         let rows = x.len();
-        let ([starts, _], inverse_pivot) = (elimination.places(rows), &self.inverse_pivot[..rows]);
-        for k in eliminated::<IN_A_ROW>(elimination, rows) {
+        let ([starts, diagonals], inverse_pivot) =
+            (elimination.places(rows), &self.inverse_pivot[..rows]);
+        let rows = starts.iter().zip(diagonals).map(|(start, end)| *start..*end).enumerate();
+        for (k, row) in rows.clone().rev() {
             let value = x[k];
-            for (&ancestor, u) in elimination.above(k).iter().zip(&self.upper[starts[k]..]) {
+            for (&ancestor, u) in elimination.ancestors(row.clone()).iter().zip(&self.upper[row]) {
                 x[ancestor] -= *u * value;
             }
         }
-        for k in eliminated::<IN_A_ROW>(elimination, rows).rev() {
+        for (k, row) in rows {
             let mut value = x[k];
-            for (&ancestor, l) in elimination.above(k).iter().zip(&self.lower[starts[k]..]) {
+            for (&ancestor, l) in elimination.ancestors(row.clone()).iter().zip(&self.lower[row]) {
                 value -= *l * x[ancestor];
             }
             x[k] = value * inverse_pivot[k];

@@ -156,7 +156,7 @@ impl<S: Planar> System<S> {
     #[inline(always)]
     fn solve(&mut self, model: &Model, x: &mut [S]) {
         match (self, &model.planar) {
-            (Self::Tree(matrix), _) => matrix.substitute::<false>(&model.elimination, x),
+            (Self::Tree(matrix), _) => matrix.substitute(&model.elimination, x),
             (Self::Planar(matrix), Some(joints)) => matrix.solve(joints, x),
             (Self::Planar(_), None) => {}
         }

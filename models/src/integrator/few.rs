@@ -137,14 +137,14 @@ impl Workspace {
                 let matrix = &mut kkt.factored.tree;
                 row.differentiate_here(joints);
                 row.place_here(joints);
-                for below in 0..N {
-                    let first = model.elimination.start(below);
+                let [starts, diagonals] = model.elimination.places(N);
+                for (below, first) in starts.iter().enumerate() {
                     for above in 0..=below {
                         row.fill_entry(joints, [above, below], h, (matrix, first + above));
                     }
                 }
-                for (i, c) in damping.iter().enumerate() {
-                    matrix.add_to_diagonal(model.elimination.diagonal(i), -at_start * c);
+                for (slot, c) in diagonals.iter().zip(damping) {
+                    matrix.add_to_diagonal(*slot, -at_start * c);
                 }
                 let pivot = matrix.factor_few(&model.elimination, inertia, 1.0 / h.abs());
                 if !(pivot.relative >= settings.singular_below) {
@@ -157,7 +157,7 @@ impl Workspace {
             if report.iterations == 1 && size <= CONVERGED {
                 break;
             }
-            kkt.factored.tree.substitute::<true>(&model.elimination, &mut r);
+            kkt.factored.tree.substitute(&model.elimination, &mut r);
             for i in 0..N {
                 x[i] -= r[i];
             }

@@ -670,12 +670,12 @@ fn eliminate<E: Eight, const B: usize, const U: usize, const W: usize>(
     if is_root {
         return;
     }
-    for a in 0..W {
-        // Number by number from memory, where compilers would take the registers apart.
-        let axis: &Generators<Line<B>> = black_box(&*axes[a]);
-        for b in 0..U {
-            for (row, upper) in sums.rows[b].iter_mut().zip(&axis.upper.0[b].0) {
-                *row = row.minus(w_over_d[a].scaled(*upper));
+    // Number by number from memory, where compilers would take the registers apart.
+    let axes: &[&mut Generators<Line<B>>; W] = black_box(&axes);
+    for (b, rows) in sums.rows.iter_mut().enumerate() {
+        for (k, row) in rows.iter_mut().enumerate() {
+            for a in 0..W {
+                *row = row.minus(w_over_d[a].scaled(axes[a].upper.0[b].0[k]));
             }
         }
     }

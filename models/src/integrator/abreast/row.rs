@@ -65,15 +65,15 @@ impl<const N: usize, const K: usize> Row<N, K> {
         self.joints.differentiate_here(joints);
         self.joints.place_here(joints);
         let (elimination, inertia) = (&model.elimination, &model.conditioning.inertia[..K]);
-        for below in 0..K {
-            let first = elimination.start(below);
+        let [starts, diagonals] = elimination.places(K);
+        for (below, first) in starts.iter().enumerate() {
             for above in 0..=below {
                 self.joints.fill_entry(joints, [above, below], h, (matrix, first + above));
             }
         }
-        for (i, c) in self.damping.iter().enumerate() {
+        for (slot, c) in diagonals.iter().zip(self.damping) {
             let slope = LanesOf::constant(-force_split.at_start() * c);
-            matrix.add_to_diagonal(elimination.diagonal(i), slope);
+            matrix.add_to_diagonal(*slot, slope);
         }
         self.pivot = matrix.factor_few(elimination, inertia, 1.0 / h.abs()).relative;
     }
@@ -228,7 +228,7 @@ impl<const N: usize> Abreast<N> {
             if !LanesOf::<N>::any(live) {
                 break;
             }
-            matrix.substitute::<true>(&model.elimination, &mut r);
+            matrix.substitute(&model.elimination, &mut r);
             for i in 0..K {
                 x[i] -= r[i];
             }
