@@ -48,8 +48,6 @@ pub trait Eight: Copy + 'static {
     }
     /// From a list of at least as many numbers as are of use.
     fn of_list(list: &[f64]) -> Self;
-    /// Put together of eight, of which those of use count.
-    fn of_numbers(numbers: [f64; 8]) -> Self;
     /// To a list of at least as many.
     fn put_list(self, list: &mut [f64]);
     /// The same number eight times.
@@ -166,10 +164,6 @@ impl Eight for Block {
         block
     }
     #[inline(always)]
-    fn of_numbers(numbers: [f64; 8]) -> Self {
-        Self(numbers)
-    }
-    #[inline(always)]
     fn put_list(self, list: &mut [f64]) {
         list.iter_mut().zip(self.0).for_each(|(number, own)| *number = own);
     }
@@ -227,10 +221,6 @@ impl Eight for f64 {
     #[inline(always)]
     fn of_list(list: &[f64]) -> Self {
         list[0]
-    }
-    #[inline(always)]
-    fn of_numbers([first, ..]: [f64; 8]) -> Self {
-        first
     }
     #[inline(always)]
     fn put_list(self, list: &mut [f64]) {
@@ -291,11 +281,11 @@ mod tests {
     struct All<'a>([&'a Block; 2]);
 
     impl InEights for All<'_> {
-        type Output = [Block; 17];
+        type Output = [Block; 16];
         #[inline(always)]
-        fn run<E: Eight>(self) -> [Block; 17] {
+        fn run<E: Eight>(self) -> [Block; 16] {
             let [a, b] = self.0.map(|block| E::of(block));
-            let mut out = [Block::ZERO; 17];
+            let mut out = [Block::ZERO; 16];
             a.plus(b).put(&mut out[0]);
             a.minus(b).put(&mut out[1]);
             a.times(b).put(&mut out[2]);
@@ -308,7 +298,6 @@ mod tests {
             a.over(b).put(&mut out[13]);
             b.times(b).sqrt().put(&mut out[14]);
             a.signed(b).put(&mut out[15]);
-            E::of_numbers(self.0[0].0).put(&mut out[16]);
             out
         }
     }

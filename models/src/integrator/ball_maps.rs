@@ -10,9 +10,6 @@ use plantd_math::spatial::{Mat3, Vec3};
 
 use crate::lagrangian::turning::Weights;
 
-/// As many ball joints stand side by side, at most.
-const BESIDE: usize = <f64 as Scalar>::BESIDE;
-
 /// Does it for all of so many ball joints. A floating base has one: side by side with nothing it would take longer.
 pub(crate) fn beside<T: Beside<f64>>(count: usize, task: T) -> T::Output {
     if count == 1 { f64::alone(task) } else { f64::beside(count, task) }
@@ -51,19 +48,20 @@ fn collect<W: Wide<f64>>(
     list: &[f64],
     others: impl Fn(usize) -> Vec3,
 ) -> Vec3<W> {
-    let mut threes = [[0.0; 3]; BESIDE];
-    for (lane, (three, &i)) in threes.iter_mut().zip(coordinates).enumerate() {
-        *three = match list.get(i..i + 3) {
-            Some(numbers) => [numbers[0], numbers[1], numbers[2]],
-            None => others(lane).0,
-        };
-    }
-    if coordinates.len() == 1 {
+    let three = |lane: usize, i: usize| match list.get(i..i + 3) {
+        Some(numbers) => [numbers[0], numbers[1], numbers[2]],
+        None => others(lane).0,
+    };
+    if let [one] = coordinates {
         // Nothing to be put together.
-        return Vec3(one_of(threes[0]));
+        return Vec3(one_of(three(0, *one)));
     }
-    let component = |k: usize| W::each(|lane| threes[lane][k]);
-    Vec3([component(0), component(1), component(2)])
+    let mut lanes = Vec3::<Block>::default();
+    for (lane, &i) in coordinates.iter().enumerate() {
+        let three = three(lane, i);
+        (0..3).for_each(|k| lanes.0[k].0[lane] = three[k]);
+    }
+    lanes.map(|numbers| W::load(numbers, 0))
 }
 
 /// The way back.
@@ -92,12 +90,13 @@ fn fours<W: Wide<f64>, T>(list: &[T], of: impl Fn(&T) -> [f64; 4]) -> [W; 4] {
     if let [one] = list {
         return one_of(of(one));
     }
-    let mut fours = [[0.0; 4]; BESIDE];
-    for (four, own) in fours.iter_mut().zip(list) {
-        *four = of(own);
+    let mut lanes = [Block::ZERO; 4];
+    for (lane, own) in list.iter().enumerate() {
+        let four = of(own);
+        (0..4).for_each(|k| lanes[k].0[lane] = four[k]);
     }
-    let component = |k: usize| W::each(|lane| fours[lane][k]);
-    [component(0), component(1), component(2), component(3)]
+    let [a, b, c, d] = &lanes;
+    [W::load(a, 0), W::load(b, 0), W::load(c, 0), W::load(d, 0)]
 }
 
 /// The way back.

@@ -85,14 +85,26 @@ fn collect<S: Scalar, W: Wide<S>>(slots: &Slots, i: usize, list: &[S]) -> W {
     }
     match list.get(i..i + W::COUNT) {
         Some(numbers) => W::first_of(numbers),
-        None => W::each(|lane| list.get(i + lane).copied().unwrap_or(S::ZERO)),
+        None => {
+            let mut several = S::Several::default();
+            for (lane, number) in list.iter().skip(i).take(W::COUNT).enumerate() {
+                number.put(&mut several, lane);
+            }
+            W::load(&several, 0)
+        }
     }
 }
 
 /// Numbers of coordinates from a list; zero beyond it.
 #[inline(always)]
 fn collect_of<S: Scalar, W: Wide<S>>(coordinates: &[usize], list: &[S]) -> W {
-    W::each(|lane| list.get(coordinates[lane]).copied().unwrap_or(S::ZERO))
+    let mut several = S::Several::default();
+    for (lane, coordinate) in coordinates.iter().enumerate() {
+        if let Some(number) = list.get(*coordinate) {
+            number.put(&mut several, lane);
+        }
+    }
+    W::load(&several, 0)
 }
 
 /// The way back, but for what is beyond the list.

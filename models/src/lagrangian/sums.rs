@@ -87,7 +87,11 @@ impl<S: Scalar> Sums<S> {
         let [p, q, r, s, t, u, x, y] = self.take_from::<W, BALLS>(i, links);
         let z = if BALLS {
             let links = &links[i..i + W::COUNT];
-            W::each(|lane| self.ninths[links[lane]])
+            let mut several = S::Several::default();
+            for (lane, link) in links.iter().enumerate() {
+                self.ninths[*link].put(&mut several, lane);
+            }
+            W::load(&several, 0)
         } else {
             W::first_of(&self.ninths[i..i + W::COUNT])
         };

@@ -94,11 +94,6 @@ impl Whole {
 impl Eight for Whole {
     type Four = Low;
     type One = Self;
-    #[inline(always)]
-    fn of_numbers([a, b, c, d, e, f, g, h]: [f64; 8]) -> Self {
-        // SAFETY: there are such registers.
-        Self(unsafe { _mm512_setr_pd(a, b, c, d, e, f, g, h) })
-    }
     number_by_number! {
         8, _mm512_loadu_pd, _mm512_storeu_pd, _mm512_set1_pd, _mm512_add_pd, _mm512_sub_pd, _mm512_mul_pd,
         _mm512_div_pd, _mm512_sqrt_pd
@@ -162,11 +157,6 @@ impl Eight for Low {
     type Four = Self;
     type One = Self;
     const COUNT: usize = 4;
-    #[inline(always)]
-    fn of_numbers([a, b, c, d, ..]: [f64; 8]) -> Self {
-        // SAFETY: there are such registers.
-        Self(unsafe { _mm256_setr_pd(a, b, c, d) })
-    }
     number_by_number! {
         4, _mm256_loadu_pd, _mm256_storeu_pd, _mm256_set1_pd, _mm256_add_pd, _mm256_sub_pd, _mm256_mul_pd,
         _mm256_div_pd, _mm256_sqrt_pd
@@ -217,11 +207,6 @@ impl Eight for Halves {
     type One = Low;
     const ZERO: Self = Self([Low::ZERO; 2]);
     const ONE: Self = Self([Low::ONE; 2]);
-    #[inline(always)]
-    fn of_numbers(numbers: [f64; 8]) -> Self {
-        let [_, _, _, _, e, f, g, h] = numbers;
-        Self([Low::of_numbers(numbers), Low::of_numbers([e, f, g, h, e, f, g, h])])
-    }
     #[inline(always)]
     fn of_list(list: &[f64]) -> Self {
         Self([Low::of_list(list), Low::of_list(&list[4..])])

@@ -24,9 +24,6 @@ pub trait Wide<S: Scalar>: Scalar {
     fn constants(eight: &Block, lane: usize) -> Self;
     /// The first numbers of a list.
     fn first_of(list: &[S]) -> Self;
-    /// Of numbers that lie apart, by lane. What was written number by number is not read as a whole: that would wait for
-    /// its way through the cache.
-    fn each(of: impl Fn(usize) -> S) -> Self;
     /// The same number everywhere.
     fn of_one(number: &S) -> Self;
     /// A row in registers.
@@ -126,10 +123,6 @@ macro_rules! alone {
             #[inline(always)]
             fn constants(eight: &Block, lane: usize) -> Self {
                 Self::constant(eight.0[lane])
-            }
-            #[inline(always)]
-            fn each(of: impl Fn(usize) -> Self) -> Self {
-                of(0)
             }
             #[inline(always)]
             fn of_one(number: &Self) -> Self {
@@ -327,18 +320,6 @@ impl<E: Eight, L: Eight> Wide<f64> for Sides<E, L> {
         Self::new(E::of_list(list))
     }
     #[inline(always)]
-    fn each(of: impl Fn(usize) -> f64) -> Self {
-        let [a, b, c, d] = match E::COUNT {
-            1 => [of(0); 4],
-            _ => [of(0), of(1), of(2), of(3)],
-        };
-        let [e, f, g, h] = match E::COUNT {
-            LANES => [of(4), of(5), of(6), of(7)],
-            _ => [a; 4],
-        };
-        Self::new(E::of_numbers([a, b, c, d, e, f, g, h]))
-    }
-    #[inline(always)]
     fn of_one(number: &f64) -> Self {
         Self::new(E::all(*number))
     }
@@ -494,10 +475,6 @@ impl<E: Eight, L: Eight, const N: usize> Wide<LanesOf<N>> for Sides<E, L> {
     #[inline(always)]
     fn constants(eight: &Block, lane: usize) -> Self {
         Self::constant(eight.0[lane])
-    }
-    #[inline(always)]
-    fn each(of: impl Fn(usize) -> LanesOf<N>) -> Self {
-        Self::of_plants(&of(0))
     }
     #[inline(always)]
     fn of_one(number: &LanesOf<N>) -> Self {
