@@ -8,8 +8,8 @@
 use std::collections::BTreeSet;
 use std::ops::Range;
 
-/// Entries of which rows have whole numbers, so that they are computed with in registers: what is beyond the diagonal
-/// means nothing.
+/// Each row takes a multiple of so many slots, for whole registers are computed with. Those beyond the diagonal mean
+/// nothing.
 pub(crate) const TOGETHER: usize = 4;
 
 /// The elimination tree.
@@ -19,7 +19,7 @@ pub struct SymbolicElimination {
     offsets: Vec<usize>,
     /// The slot of the diagonal of each row, with which it ends.
     diagonals: Vec<usize>,
-    /// Ancestors of each row, root first, the row itself last, and then some more times.
+    /// Ancestors of each row, root first, the row itself last, and again in the slots that mean nothing.
     ancestors: Vec<usize>,
     /// Row `i` owns `descendants[descendant_offsets[i]..descendant_offsets[i + 1]]`.
     descendant_offsets: Vec<usize>,
@@ -132,7 +132,7 @@ impl SymbolicElimination {
         slots.clone().zip(self.ancestors[slots].iter().copied())
     }
 
-    /// Slots of one triangle, those that mean nothing included.
+    /// Slots of one triangle.
     pub fn slots(&self) -> usize {
         self.ancestors.len()
     }

@@ -66,7 +66,7 @@ impl<S: Compared> Beside<S> for Factor<'_, S> {
         for ((reference, diagonal), scale) in reference.iter_mut().zip(diagonals).zip(scale) {
             *reference = upper[*diagonal].abs().max(S::constant(scale * factor));
         }
-        // What is beyond the diagonal of a row is computed with it where that is one operation.
+        // What is beyond the diagonal of a row is subtracted from with it, where that is one operation.
         let width = |entries: usize| match W::TAKES_FOURS {
             true => entries.next_multiple_of(TOGETHER),
             false => entries,
@@ -82,7 +82,7 @@ impl<S: Compared> Beside<S> for Factor<'_, S> {
             smallest.see(k, pivot, reference[k]);
             let inverse = pivot.recip();
             inverse_pivot[k] = inverse;
-            for entry in &mut upper_row[..width(depth)] {
+            for entry in &mut upper_row[..depth] {
                 *entry = *entry * inverse;
             }
             for (d, &ancestor) in ancestors.iter().enumerate().rev() {
