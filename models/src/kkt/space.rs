@@ -193,9 +193,9 @@ impl<E: Eight, const B: usize> Sums<E, B> {
     #[inline(always)]
     fn of<const L: usize>(rows: &Kept<L>) -> Self {
         let mut sums = Self::zero();
-        for b in 0..B {
-            for k in 0..8 {
-                sums.rows[b][k] = InLine::of(&rows[b][k]);
+        for (own, rows) in sums.rows.iter_mut().zip(rows) {
+            for (own, row) in own.iter_mut().zip(rows) {
+                *own = InLine::of(row);
             }
         }
         sums
@@ -241,9 +241,9 @@ impl<E: Eight, const B: usize> Sums<E, B> {
     /// To the first blocks of what has more.
     #[inline(always)]
     fn put<const L: usize>(&self, rows: &mut Kept<L>) {
-        for b in 0..B {
-            for k in 0..8 {
-                self.rows[b][k].put(&mut rows[b][k]);
+        for (own, rows) in self.rows.iter().zip(rows) {
+            for (own, row) in own.iter().zip(rows) {
+                own.put(row);
             }
         }
     }
