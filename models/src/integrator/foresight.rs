@@ -85,6 +85,11 @@ impl<S: Compared> Strayed<S> {
         product * largest.sqrt() * (moved + 1.0) / unit
     }
 
+    /// `α`.
+    pub(crate) fn turned(&self) -> S {
+        self.turned
+    }
+
     /// A new Jacobian, where there is one.
     #[inline(always)]
     pub(crate) fn begin_again(&mut self, is_fresh: S::Truth) {

@@ -317,6 +317,9 @@ impl Workspace {
                 {
                     report.residual = left.min(expected);
                     self.step.is_evaluated = false;
+                    if BODIES && chord.is_fresh && self.kkt.in_space.is_some() {
+                        self.step.strayed = strayed.turned();
+                    }
                     break;
                 }
             }

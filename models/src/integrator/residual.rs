@@ -94,7 +94,7 @@ impl Workspace {
             self.turn_to_midpoint(model);
         }
         self.mid.evaluate(model);
-        self.step.is_evaluated = true;
+        (self.step.is_evaluated, self.step.strayed) = (true, f64::INFINITY);
         let weight = settings.force_split.at_start() * h;
         self.residual.sum_up(state, &self.mid, 0.5 * h, weight);
         self.residual.round_off = largest(&self.residual.magnitudes).max(f64::MIN_POSITIVE);

@@ -278,15 +278,13 @@ impl Workspace {
         });
         ends.time_step_s = settings.time_step_s;
         ends.at_start = settings.force_split.at_start();
-        if !self.step.is_evaluated {
-            self.evaluate(model, settings, at.state);
-        }
+        let is_differentiated = self.evaluate_solution(at);
         self.response.save_first(&mut self.kkt);
         if model.planar.is_some() {
             let mid = &mut self.mid;
             let motion = [&mid.angles[..], &mid.velocity];
             mid.mechanics.differentiate_in_space(model, motion, &mid.orientations, [x, momentum]);
-        } else {
+        } else if !is_differentiated {
             self.mid.mechanics.differentiate(model);
         }
         if !has_fields {
