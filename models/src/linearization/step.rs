@@ -535,7 +535,7 @@ mod tests {
     /// Where the second derivatives of a guess stand for those of the solution, these are the same.
     #[test]
     fn derivatives_next_to_the_solution_are_those_at_it() {
-        for name in ["walker-4", "walker-9", "balls-2", "balls-7"] {
+        for name in ["walker-4", "walker-9"] {
             let model = Arc::new(Model::compile(&builtin::scene(name).unwrap()).unwrap());
             let settings = Settings { time_step_s: 5e-4, ..Settings::new(&model) };
             let mut plant = Plant::new(Arc::clone(&model), settings).unwrap();
