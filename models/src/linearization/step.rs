@@ -535,7 +535,10 @@ mod tests {
     /// Where the second derivatives of a guess stand for those of the solution, these are the same.
     #[test]
     fn derivatives_next_to_the_solution_are_those_at_it() {
-        for name in ["walker-4", "walker-9"] {
+        // How far `A` and `B` go along with a correction grows with the tree.
+        for (name, bound) in
+            [("walker-4", 1e-13), ("walker-9", 1e-13), ("balls-7", 1e-13), ("balls-31", 1e-11)]
+        {
             let model = Arc::new(Model::compile(&builtin::scene(name).unwrap()).unwrap());
             let settings = Settings { time_step_s: 5e-4, ..Settings::new(&model) };
             let mut plant = Plant::new(Arc::clone(&model), settings).unwrap();
@@ -566,7 +569,7 @@ mod tests {
                         of(&at, other, Layout::Rows);
                         let size = largest(one);
                         one.iter_mut().zip(other).for_each(|(one, other)| *one -= *other);
-                        assert!(largest(one) <= 1e-13 * size, "{name}: {}", largest(one) / size);
+                        assert!(largest(one) <= bound * size, "{name}: {}", largest(one) / size);
                     }
                 }
                 plant.commit();
