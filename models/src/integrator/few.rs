@@ -196,7 +196,7 @@ impl Workspace {
         }
         kkt.factored.valid = Factors::Tree;
         kkt.estimates.write(&mut report);
-        (step.report, step.is_evaluated, step.strayed) = (report, is_evaluated, f64::INFINITY);
+        (step.report, step.is_evaluated) = (report, is_evaluated);
         // What a linearization at the last evaluation needs of it.
         if is_evaluated {
             mid.mechanics.planar.as_deref_mut()?.take(&row);

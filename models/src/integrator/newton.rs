@@ -317,7 +317,7 @@ impl Workspace {
                 {
                     report.residual = left.min(expected);
                     self.step.is_evaluated = false;
-                    if BODIES && chord.is_fresh && self.kkt.in_space.is_some() {
+                    if BODIES && chord.is_fresh {
                         self.step.strayed = strayed.turned();
                     }
                     break;

@@ -57,8 +57,8 @@ pub(crate) struct StepIncrement {
     pub(crate) q_end: Vec<f64>,
     /// Whether the last evaluation was at the increment.
     pub(crate) is_evaluated: bool,
-    /// `Σ |x'|` of the corrections since the last evaluation, of bodies that are linearized by generators in space and
-    /// whose system was factored there; else infinite.
+    /// `Σ |x'|` of the corrections since the last evaluation, of bodies whose system was factored there; else infinite.
+    /// Steps of [a few joints](super::few) leave it as it is.
     pub(crate) strayed: f64,
     /// How it was solved. It stays here: to hand it on from function to function takes a tenth of a pendulum's step.
     pub(crate) report: StepReport,

@@ -77,10 +77,10 @@ impl Workspace {
         Ok(())
     }
 
-    /// Evaluates the solution, unless it has been, or is next to where the step was factored; whether the second
-    /// derivatives of bodies are there, too.
+    /// Evaluates the solution, unless it has been, or is next to where the step was factored, of trees in space that
+    /// are linearized by generators; whether the second derivatives of bodies are there, too.
     pub(crate) fn evaluate_solution(&mut self, at: StepContext<'_>) -> bool {
-        let is_differentiated = self.step.strayed <= UNNOTICED;
+        let is_differentiated = self.kkt.in_space.is_some() && self.step.strayed <= UNNOTICED;
         if !self.step.is_evaluated && !is_differentiated {
             self.evaluate(at.model, at.settings, at.state);
         }
