@@ -162,6 +162,17 @@ def cases(count):
         yield batch.case(q=[0.001 * k, math.sin(k)], velocity=[0.0, 0.0003 * k])
 
 
+def noted(file):
+    """`batch.run` for a node's worker, with a line in a file of each piece that it begins."""
+
+    def run(piece):
+        with file.open("a") as begun:
+            begun.write(f"{piece.first}\n")
+        return batch.run(piece)
+
+    return run
+
+
 def digest(done):
     done.raise_errors()
     return hashlib.sha256(done.x.tobytes()).hexdigest()
@@ -171,7 +182,7 @@ def main():
     count, steps = map(int, sys.argv[1:])
     common = batch.case([[0.3]], steps=steps - 1)
     times = Times()
-    told = {"cases": count}
+    told = {"cases": count, "size": SIZE}
 
     def measured(name, over, given):
         before, of_all, begun = times.of_servers(), times.of_all(), time.monotonic()
@@ -202,7 +213,14 @@ def main():
                     told["servers_of_lost_node"] = kill_node(nodes[1])
                 yield one
 
+        # Workers import the module for themselves: what they call is its own `run`.
+        begun = Path(folder) / "begun"
+        batch.run, run = noted(begun), batch.run
         measured("nodes", ray, killing())
+        batch.run = run
+        firsts = begun.read_text().split()
+        told["pieces"], told["pieces_again"] = len(set(firsts)), len(firsts) - len(set(firsts))
+        told["most_under_way"] = batch._WAITING * NODES
         # It takes Ray a while to believe it, longer than a short batch.
         deadline = time.monotonic() + PATIENCE
         while alive() == NODES and time.monotonic() < deadline:
