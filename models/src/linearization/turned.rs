@@ -16,6 +16,7 @@
 
 use plantd_math::eights::{Eight, InEights, in_eights};
 use plantd_math::rotation;
+use plantd_math::simd::wide;
 use plantd_math::spatial::{Mat3, three};
 
 use crate::integrator::balls::BallJoints;
@@ -166,6 +167,7 @@ impl Sink<'_> {
 impl OfBall {
     /// What the Lagrangian of the bodies gives. The change of `m × ξ + (2a − 1) h (T⁻ − 1) f` with `ξ` is
     /// `turned`.
+    #[inline(always)]
     fn new(turning: &Turning, within: &Within, turned: &Mat3, h: f64) -> Self {
         let Within { tau_z, tau_v, m_v } = within;
         let (start, middle) = (&turning.by_start.0, &turning.by_next.0);
@@ -327,21 +329,27 @@ impl Workspace {
         let turns = model.orientations.iter().zip(balls.turns());
         ends.turnings.clear();
         ends.turnings.extend(turns.map(|(&i, turn)| Turning::new(model, i, turn, h)));
-        for (first, joint) in model.dynamics.joints.iter().enumerate() {
-            let i = joint.coordinate;
-            if joint.kind != JointKind::Ball(0) || i >= nd {
-                continue;
+        let (turnings, all) = (&ends.turnings[..], &mut tangents.balls[..]);
+        wide!({
+            for (first, joint) in model.dynamics.joints.iter().enumerate() {
+                let i = joint.coordinate;
+                if joint.kind != JointKind::Ball(0) || i >= nd {
+                    continue;
+                }
+                let turning = &turnings[joint.orientation];
+                let mut turned = rotation::crossed(-three(&mid.l_v, i));
+                if skew != 0.0 {
+                    let forces = turning.turn.changes().of_torque(three(&mid.force, i));
+                    turned = turned.plus(&forces.scaled(skew));
+                }
+                let within = mid.mechanics.curvature.within_ball(first);
+                let own = &mut all[joint.orientation];
+                *own = OfBall::new(turning, &within, &turned, h);
+                for (axis, c) in model.damping.iter().skip(i).take(3).enumerate() {
+                    own.add(turning, axis, [*c, 0.0], [h, skew]);
+                }
             }
-            let turning = &ends.turnings[joint.orientation];
-            let forces = turning.turn.changes().of_torque(three(&mid.force, i));
-            let turned = rotation::crossed(-three(&mid.l_v, i)).plus(&forces.scaled(skew));
-            let within = mid.mechanics.curvature.within_ball(first);
-            let own = &mut tangents.balls[joint.orientation];
-            *own = OfBall::new(turning, &within, &turned, h);
-            for (axis, c) in model.damping.iter().skip(i).take(3).enumerate() {
-                own.add(turning, axis, [*c, 0.0], [h, skew]);
-            }
-        }
+        });
         for a in &model.armature {
             if let Some((o, axis)) = balls.of(a.row) {
                 tangents.balls[o].add(&ends.turnings[o], axis, [0.0, a.inertia], [h, skew]);

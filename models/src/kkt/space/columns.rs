@@ -35,7 +35,7 @@ use plantd_math::rows::Block;
 use crate::kkt::space::lines::Line;
 use crate::kkt::space::margins::{Among, Margins};
 use crate::kkt::space::vectors::Margin;
-use crate::kkt::space::{Fork, Group, GroupKind, Limb, SpatialRecursion, Square};
+use crate::kkt::space::{Fork, Group, GroupKind, Limb, SpatialRecursion, Square, WIDEST};
 use crate::lagrangian::generators::Generators;
 
 /// Where the derivatives of the increment and of the momentum go: rows of coordinates, `stride` apart.
@@ -53,7 +53,34 @@ pub(super) struct Columns<const B: usize> {
     motions: Vec<[[Block; 8]; B]>,
     increment: Vec<Block>,
     momentum: Vec<Block>,
+    /// Of each limb, its first group with some of the columns at it or below it.
+    reached: Vec<usize>,
 }
+
+/// The coordinates of some columns: those of the configuration and those of the momentum.
+struct Window([Range<usize>; 2]);
+
+impl Window {
+    /// Of columns that begin with `first`.
+    fn new(first: usize, count: usize, coordinates: usize) -> Self {
+        let of = |before: usize| {
+            let at = |column: usize| column.saturating_sub(before).min(coordinates);
+            at(first)..at(first + count)
+        };
+        Self([of(0), of(coordinates)])
+    }
+
+    /// Whether one of them is among the coordinates of a group, or of what is below it.
+    #[inline(always)]
+    fn is_below(&self, group: &Group) -> bool {
+        let Self(windows) = self;
+        let meet = |a: &Range<usize>, b: &Range<usize>| a.start.max(b.start) < a.end.min(b.end);
+        group.reach.iter().any(|reach| windows.iter().any(|window| meet(reach, window)))
+    }
+}
+
+/// Of groups with none of the columns at or below them.
+const NOTHING: [Block; WIDEST] = [Block::ZERO; WIDEST];
 
 /// The unit of a column, where it is one of a block.
 #[inline(always)]
@@ -124,8 +151,9 @@ fn of_blocks<E: Eight, const B: usize, const U: usize>(blocks: &Flow<Block, B>) 
 
 impl<const B: usize> Columns<B> {
     pub(super) fn make_room(&mut self, recursion: &SpatialRecursion<B>) {
-        let SpatialRecursion { axes, flows, .. } = recursion;
-        let Self { flows: up, motions: down, increment, momentum } = self;
+        let SpatialRecursion { axes, flows, limbs, .. } = recursion;
+        let Self { flows: up, motions: down, increment, momentum, reached } = self;
+        reached.resize(limbs.len(), 0);
         for flows_of_eight in [up, down] {
             flows_of_eight.resize(flows.len(), [[Block::ZERO; 8]; B]);
         }
@@ -142,41 +170,43 @@ impl<const B: usize> Columns<B> {
         margins: &Margins<B>,
         first: usize,
     ) {
-        for limb in &recursion.limbs {
+        let window = Window::new(first, E::COUNT, recursion.axes.len());
+        for (at, limb) in recursion.limbs.iter().enumerate() {
+            let mut groups = limb.groups.clone();
+            let is_reached = |at: &usize| window.is_below(&recursion.groups[*at]);
+            if !groups.end.checked_sub(1).is_some_and(|top| is_reached(&top)) {
+                self.reached[at] = groups.end;
+                continue;
+            }
+            groups.start = groups.clone().find(is_reached).unwrap_or(groups.end);
+            self.reached[at] = groups.start;
             if B > 1 && limb.is_acted_on {
-                self.climb::<E, B>(limb, recursion, margins, first);
+                self.climb::<E, B>((limb, groups), recursion, margins, first);
             } else {
-                self.climb::<E, 1>(limb, recursion, margins, first);
+                self.climb::<E, 1>((limb, groups), recursion, margins, first);
             }
         }
     }
 
-    /// Up a limb whose vectors have `U` blocks of use.
+    /// Up a limb whose vectors have `U` blocks of use, from the first group that is reached.
     #[inline(always)]
     fn climb<E: Eight, const U: usize>(
         &mut self,
-        limb: &Limb,
+        (limb, reached): (&Limb, Range<usize>),
         recursion: &SpatialRecursion<B>,
         margins: &Margins<B>,
         first: usize,
     ) {
         let SpatialRecursion { groups, axes, within, .. } = recursion;
         let n = axes.len();
-        let has = |reach: &Range<usize>, more: usize| {
-            reach.start < reach.end
-                && reach.start + more < first + E::COUNT
-                && first < reach.end + more
-        };
-        let Limb { groups: own, carries, hangs_from, .. } = limb;
+        let Limb { carries, hangs_from, .. } = limb;
         let mut flow = [[E::ZERO; 8]; U];
         if let Some(place) = *carries {
             flow = of_blocks(&self.flows[place]);
             self.flows[place] = [[Block::ZERO; 8]; B];
         }
-        let mut any = false;
-        for at in own.clone() {
-            let Group { axes: range, rows, kind, reach, is_end } = &groups[at];
-            any = any || reach.iter().any(|reach| has(reach, 0) || has(reach, n));
+        for at in reached {
+            let Group { axes: range, rows, kind, is_end, .. } = &groups[at];
             let (start, own_margins) = (rows.start, &margins.axes[range.clone()]);
             let increment = &mut self.increment[range.clone()];
             let momentum = &mut self.momentum[range.clone()];
@@ -186,10 +216,6 @@ impl<const B: usize> Columns<B> {
                         let vectors = [&own.below, &own.push];
                         add_moved(&mut flow, vectors, [column, n + column], first);
                     }
-                }
-                _ if !any => {
-                    increment.fill(Block::ZERO);
-                    momentum.fill(Block::ZERO);
                 }
                 _ => {
                     let group = Lifted {
@@ -213,7 +239,7 @@ impl<const B: usize> Columns<B> {
                 end(&mut flow);
             }
         }
-        if let (true, Some(Fork { place, .. })) = (any, hangs_from) {
+        if let Some(Fork { place, .. }) = hangs_from {
             let all = self.flows[*place].as_flattened_mut().iter_mut();
             for (all, own) in all.zip(flow.as_flattened()) {
                 E::of(all).plus(*own).put(all);
@@ -230,8 +256,9 @@ impl<const B: usize> Columns<B> {
         first: usize,
         rows: &mut Rows<'_>,
     ) {
-        for limb in recursion.limbs.iter().rev() {
-            if B > 1 && limb.is_acted_on {
+        for (at, limb) in recursion.limbs.iter().enumerate().rev() {
+            let limb = (limb, self.reached[at]);
+            if B > 1 && limb.0.is_acted_on {
                 self.climb_down::<E, B>(limb, recursion, margins, first, rows);
             } else {
                 self.climb_down::<E, 1>(limb, recursion, margins, first, rows);
@@ -239,11 +266,11 @@ impl<const B: usize> Columns<B> {
         }
     }
 
-    /// Down a limb.
+    /// Down a limb, with the first group that is reached.
     #[inline(always)]
     fn climb_down<E: Eight, const U: usize>(
         &mut self,
-        limb: &Limb,
+        (limb, reached): (&Limb, usize),
         recursion: &SpatialRecursion<B>,
         margins: &Margins<B>,
         first: usize,
@@ -269,11 +296,16 @@ impl<const B: usize> Columns<B> {
                 }
                 continue;
             }
+            let (mut increment, mut momentum) = (&NOTHING[..], &NOTHING[..]);
+            if at >= reached {
+                increment = &self.increment[range.clone()];
+                momentum = &self.momentum[range.clone()];
+            }
             let group = Lowered {
                 margins: own_margins,
                 among: &margins.among[at],
-                increment: &self.increment[range.clone()],
-                momentum: &self.momentum[range.clone()],
+                increment,
+                momentum,
                 start,
                 first,
             };
