@@ -657,7 +657,9 @@ mod tests {
             let ni = model.dimensions.input();
             let mut plant = Plant::new(Arc::clone(&model), Settings::new(&model)).unwrap();
             let u: Vec<f64> = (0..ni).map(|i| (i as f64).sin()).collect();
-            (0..20).for_each(|_| drop(plant.step(&u).unwrap()));
+            for _ in 0..20 {
+                plant.step(&u).unwrap();
+            }
             let (mut out, mut products) = (Linearization::new(&model), StepDerivative::new(&model));
             plant.linearize(&u, &mut out).unwrap();
             plant.differentiate(&u, &mut products).unwrap();
