@@ -299,13 +299,24 @@ impl Turned {
         rows
     }
 
-    /// Numbers of the row from a column on.
+    /// Numbers of eight rows from a column on.
     #[inline(always)]
-    fn row<E: Eight>(&self, source: &[f64], stride: usize, left: usize) -> E {
+    fn rows<E: Eight>(
+        tile: &[Self; TILE],
+        source: &[f64],
+        stride: usize,
+        left: usize,
+    ) -> [E; TILE] {
         let at = |row: usize| E::of_list(&source[row * stride + left..]);
-        let Some([x, y, z]) = self.weights else { return at(self.first) };
-        let sum = at(self.first).scaled(x).plus(at(self.first + 1).scaled(y));
-        sum.plus(at(self.first + 2).scaled(z))
+        let mut rows = [E::ZERO; TILE];
+        for (row, Self { first, weights }) in rows.iter_mut().zip(tile) {
+            *row = at(*first);
+            if let Some([x, y, z]) = *weights {
+                let sum = row.scaled(x).plus(at(first + 1).scaled(y));
+                *row = sum.plus(at(first + 2).scaled(z));
+            }
+        }
+        rows
     }
 }
 
@@ -327,12 +338,9 @@ impl InEights for TransposeTurned<'_> {
     fn run<E: Eight>(self) {
         let Self { to, apart, source, stride, size: [count, width], turnings } = self;
         for top in tiles(count) {
-            let from = Turned::tile(turnings, top);
+            let tile = Turned::tile(turnings, top);
             for left in tiles(width) {
-                let mut rows = [E::ZERO; TILE];
-                for (row, from) in rows.iter_mut().zip(&from) {
-                    *row = from.row(source, stride, left);
-                }
+                let rows = Turned::rows::<E>(&tile, source, stride, left);
                 for (j, column) in E::transposed(rows).iter().enumerate() {
                     column.put_list(&mut to[(left + j) * apart + top..]);
                 }
@@ -362,14 +370,11 @@ impl InEights for TimesBalls<'_> {
         let Self { to, steps: [down, right], source, stride, count, impulses, turnings } = self;
         let width = impulses.len() / 3;
         for top in tiles(count) {
-            let from = Turned::tile(turnings, top);
+            let tile = Turned::tile(turnings, top);
             for first in (0..width).step_by(6).map(|first| first.min(width - 6)) {
                 // Of the last two joints there may be no eight numbers from the first one on.
                 let left = first.min(width - TILE);
-                let mut rows = [E::ZERO; TILE];
-                for (row, from) in rows.iter_mut().zip(&from) {
-                    *row = from.row(source, stride, left);
-                }
+                let rows = Turned::rows(&tile, source, stride, left);
                 let [a, b, c, d, e, f, g, h] = E::transposed(rows);
                 let [a, b, c, d, e, f] =
                     if left == first { [a, b, c, d, e, f] } else { [c, d, e, f, g, h] };
@@ -404,7 +409,8 @@ fn put_three<E: Eight>(
     }
 }
 
-/// Where tiles begin that cover so many rows or columns: the last one overlaps with the one before.
+/// Where tiles begin that cover so many rows or columns, at least those of one: the last one overlaps with the one
+/// before.
 #[inline(always)]
 fn tiles(count: usize) -> impl Iterator<Item = usize> {
     (0..count).step_by(TILE).map(move |first| first.min(count - TILE))
@@ -489,11 +495,12 @@ impl Linearization {
         }
     }
 
-    /// Writes `B` where all inputs are those of ball joints: whether it is so.
+    /// Writes `B` of a step where all inputs are those of ball joints, tile by tile: whether it is so.
     fn put_inputs_of_balls(&self, b: &mut Target<'_>) -> bool {
         let (nd, stride, impulses) = (self.nd, self.stride, &self.ends.inputs[..]);
+        let is_plain = self.kind == Kind::Step && self.nk == 0 && impulses.len() == 3 * self.ni;
         let is_large = nd >= TILE && self.ni >= TILE;
-        if self.nk > 0 || !is_large || impulses.len() != 3 * self.ni || !are_of_balls(impulses) {
+        if !is_plain || !is_large || !are_of_balls(impulses) {
             return false;
         }
         let steps = match b.layout {
@@ -521,7 +528,7 @@ impl Linearization {
         let (nd, nk, ni, stride) = (self.nd, self.nk, self.ni, self.stride);
         let n = nd + nk;
         let mut b = Target::new(out, layout, [2 * n, ni + nk]);
-        if self.kind == Kind::Step && self.put_inputs_of_balls(&mut b) {
+        if self.put_inputs_of_balls(&mut b) {
             return;
         }
         b.clear();
