@@ -20,7 +20,7 @@ const BUILD: [&str; 8] =
 /// Ready soon, and nearly as fast as a release.
 const PROFILE: &str = "demo";
 /// What a first build has taken elsewhere, without the time to fetch crates.
-const BUILD_TIME: &str = "five to fifteen minutes on two cores";
+const BUILD_TIME: &str = "five to twenty minutes on two cores";
 /// How often the bar is drawn anew.
 const REFRESH: Duration = Duration::from_millis(200);
 
