@@ -323,7 +323,7 @@ impl Continuous {
         if nc > 0 {
             let Equations { closure, q, .. } = &mut self.equations;
             closure.differentiate(model, q);
-            let SchurComplement { responses, lu } = &mut self.schur;
+            let SchurComplement { responses, lu, .. } = &mut self.schur;
             let width = padded(nc);
             for (c, row) in closure.jacobian.chunks_exact(n).enumerate() {
                 row[..nd]

@@ -118,7 +118,7 @@ fn assemble(scene: &Scene, layout: Layout) -> Model {
     // 0.75 of the time, one of 64 a quarter.
     let is_moved = dynamics.joints.iter().any(|joint| joint.coordinate >= dynamic);
     let is_free = dimensions.constraints == 0;
-    let goes_to_space = needs_poses || (is_moved && is_free && Solver::is_deep(&elimination, 0));
+    let goes_to_space = needs_poses || (is_moved && is_free && Solver::is_deep(&elimination, 0, 0));
     let planar = if goes_to_space { None } else { planar(&dynamics, gravity) };
     let mut model = Model {
         acting: None,
@@ -156,7 +156,9 @@ fn assemble(scene: &Scene, layout: Layout) -> Model {
     };
     model.impulses = model.input_pattern().count();
     model.acting = model.find_acting();
-    model.foresees_elements = model.is_generated_in_space() && !model.has_simple_elements();
+    model.foresees_elements = dimensions.constraints == 0
+        && model.is_generated_in_space()
+        && !model.has_simple_elements();
     model.solver = Solver::of(&model);
     model.initial_violations = model.violations_at_start();
     model.conditioning = Conditioning::new(&model);

@@ -30,6 +30,9 @@ impl Workspace {
             self.differentiate_end(model);
         }
         if self.factor_recursion(model, settings)? {
+            if self.kkt.has_schur() && model.dimensions.constraints > 0 {
+                self.factor_schur(model, settings)?;
+            }
             return Ok(());
         }
         if has_loops {
@@ -179,10 +182,16 @@ impl Workspace {
     ) -> Result<(), StepError> {
         let Settings { time_step_s, singular_below, .. } = *settings;
         let constraints = [&self.constraints.start, &self.constraints.end];
-        if self.kkt.factor_schur(model, constraints, time_step_s, singular_below) {
+        let is_regular = self.kkt.factor_schur(model, constraints, time_step_s, singular_below);
+        self.check_schur(model, is_regular)
+    }
+
+    /// Names the constraints where `S` is not regular.
+    pub(crate) fn check_schur(&mut self, model: &Model, is_regular: bool) -> Result<(), StepError> {
+        if is_regular {
             return Ok(());
         }
-        let SchurComplement { responses, lu } = &mut self.kkt.schur;
+        let SchurComplement { responses, lu, .. } = &mut self.kkt.schur;
         fill_schur(model, &self.constraints.end, responses, lu);
         Err(model.singular_constraints(&lu.matrix, self.kkt.estimates.constraints))
     }

@@ -10,6 +10,7 @@ use crate::integrator::response::Response;
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::kkt::planar::Diagonals;
+use crate::kkt::pushes::Pushes;
 use crate::kkt::space::margins::OfBall;
 use crate::kkt::system::KktSystem;
 use crate::lagrangian::generators::Flanks;
@@ -116,6 +117,8 @@ pub(crate) struct Tangents {
     pub(crate) flanks: Vec<Flanks>,
     /// What ball joints have of themselves.
     pub(crate) balls: Vec<OfBall>,
+    /// For linearizations by generators, with constraints.
+    pub(crate) pushes: Pushes,
     pub(crate) terms: Vec<Term>,
 }
 
@@ -135,17 +138,21 @@ impl Workspace {
         let d = model.dimensions;
         let (nd, n, nc) = (d.dynamic, d.coordinates(), d.constraints);
         let zeros = |len: usize| vec![0.0; len];
-        let kkt = KktSystem::new(model, spread(padded(2 * n)));
+        let stride = spread(padded(2 * n));
+        let kkt = KktSystem::new(model, stride);
         let mut tangents = Tangents {
             diagonals: Diagonals::new(nd),
             constraint_hessian: zeros(if nc > 0 { n * n } else { 0 }),
             end_slopes: Vec::new(),
             flanks: Vec::new(),
             balls: vec![OfBall::ZERO; model.orientations.len()],
+            pushes: Pushes::default(),
             terms: Vec::with_capacity(nd.max(nc)),
         };
         if kkt.in_space.is_none() {
             tangents.make_room(model);
+        } else if nc > 0 {
+            tangents.pushes = Pushes::new(model, stride);
         }
         Self {
             response: Response::new(model),

@@ -1,13 +1,15 @@
 //! The linear system of a step, `[K −A0ᵀ; A1 0]`, factored and solved.
 //!
 //! [`system`] is the one door: it factors, solves, and falls back. Behind it any scene has a tree LU of `K` with
-//! the Schur complement of its constraints ([`schur`]); [`planar`] and [`space`] eliminate trees in O(n), and
+//! the Schur complement of its constraints ([`schur`]); [`planar`] and [`space`] eliminate trees in O(n), which
+//! [`pushes`] brings together with constraints in linearizations, and
 //! [`loops`] planar mechanisms together with their constraints, front by front, [`held`] limbs with the equations
 //! that hold their ends.
 
 pub(crate) mod held;
 pub(crate) mod loops;
 pub(crate) mod planar;
+pub(crate) mod pushes;
 pub(crate) mod schur;
 pub(crate) mod space;
 pub(crate) mod system;

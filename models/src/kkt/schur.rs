@@ -5,6 +5,7 @@ use plantd_math::rows::padded;
 use plantd_math::tree_lu::TreeLu;
 
 use crate::constraints::closure::Closure;
+use crate::kkt::system::{Factored, Factors, Recursion};
 use crate::model::mechanism::Model;
 
 /// `S`, factored, with what it is made of.
@@ -13,17 +14,37 @@ pub(crate) struct SchurComplement {
     /// `K⁻¹ A0ᵀ`, row-major, nd by padded nc.
     pub(crate) responses: Vec<f64>,
     pub(crate) lu: PivotedLu,
+    /// A row of the Jacobian, of dynamic coordinates.
+    row: Vec<f64>,
 }
 
 impl SchurComplement {
     pub(crate) fn new(model: &Model, stride: usize) -> Self {
         let d = model.dimensions;
         let responses = vec![0.0; d.dynamic * padded(d.constraints)];
-        Self { responses, lu: room_for_schur(model, stride) }
+        Self { responses, lu: room_for_schur(model, stride), row: vec![0.0; d.dynamic] }
     }
 
-    /// Factors `S` with the `K` that is factored, and the Jacobians at the start and the end.
-    pub(crate) fn factor(&mut self, model: &Model, tree: &mut TreeLu, [start, end]: [&Closure; 2]) {
+    /// Finds `K⁻¹ A0ᵀ` by the valid factors, with the Jacobian at the start.
+    pub(crate) fn respond(&mut self, model: &Model, factored: &mut Factored, start: &Closure) {
+        let Factored { tree, recursion, valid } = factored;
+        let (Recursion::Spatial(recursion), Factors::Recursion) = (recursion, *valid) else {
+            self.respond_by_tree(model, tree, start);
+            return;
+        };
+        let (n, nc) = (model.dimensions.coordinates(), model.dimensions.constraints);
+        let Self { responses, row, .. } = self;
+        for c in 0..nc {
+            let jacobian = &start.jacobian[c * n..];
+            row.copy_from_slice(&jacobian[..model.dimensions.dynamic]);
+            recursion.solve(row);
+            let column = responses.iter_mut().skip(c).step_by(padded(nc));
+            column.zip(&*row).for_each(|(response, x)| *response = *x);
+        }
+    }
+
+    /// The same by a tree LU.
+    pub(crate) fn respond_by_tree(&mut self, model: &Model, tree: &mut TreeLu, start: &Closure) {
         let (n, nc) = (model.dimensions.coordinates(), model.dimensions.constraints);
         let stride = padded(nc);
         for i in 0..model.dimensions.dynamic {
@@ -32,6 +53,10 @@ impl SchurComplement {
             }
         }
         tree.solve_rows(&model.elimination, &mut self.responses, stride, stride);
+    }
+
+    /// Factors `S` by `K⁻¹ A0ᵀ`, with the Jacobian at the end.
+    pub(crate) fn factor(&mut self, model: &Model, end: &Closure) {
         fill_schur(model, end, &self.responses, &mut self.lu);
         self.lu.factor();
     }

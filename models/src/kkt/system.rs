@@ -73,7 +73,7 @@ pub(crate) enum Recursion {
 /// Which factors are valid.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) enum Factors {
-    /// The tree LU, with the Schur complement where there are constraints.
+    /// The tree LU.
     #[default]
     Tree,
     Recursion,
@@ -221,10 +221,11 @@ impl KktSystem {
             }
         };
         *valid = Factors::Recursion;
-        if kind == MatrixKind::Mass {
-            Ok(true)
-        } else {
+        if kind == MatrixKind::Newton {
             self.judge(pivot, singular_below).map(|()| true)
+        } else {
+            let is_free = model.constraints.is_empty();
+            Ok(is_free || self.factor_schur(model, constraints, time_step_s, singular_below))
         }
     }
 
@@ -264,15 +265,27 @@ impl KktSystem {
         if pivot.relative >= singular_below { Ok(()) } else { Err(pivot) }
     }
 
-    /// Factors `S` by the tree LU and the Jacobians at the start and the end; false if it is singular.
+    /// Factors `S` by the valid factors and the Jacobians at the start and the end; false if it is singular.
     pub(crate) fn factor_schur(
         &mut self,
         model: &Model,
-        constraints: [&Closure; 2],
+        [start, end]: [&Closure; 2],
         time_step_s: f64,
         singular_below: f64,
     ) -> bool {
-        self.schur.factor(model, &mut self.factored.tree, constraints);
+        self.schur.respond(model, &mut self.factored, start);
+        self.close_schur(model, end, time_step_s, singular_below)
+    }
+
+    /// The same by the responses that there are.
+    pub(crate) fn close_schur(
+        &mut self,
+        model: &Model,
+        end: &Closure,
+        time_step_s: f64,
+        singular_below: f64,
+    ) -> bool {
+        self.schur.factor(model, end);
         let lu = &self.schur.lu;
         self.estimates.constraints =
             lu.reciprocal_condition(model.constraint_rank(), time_step_s.abs());
@@ -300,6 +313,9 @@ impl KktSystem {
             }
             (Recursion::Spatial(recursion), Factors::Recursion, _) => {
                 recursion.solve(x);
+                if !lambda.is_empty() {
+                    self.schur.close(model, end, x, lambda);
+                }
             }
             (Recursion::Held(limbs), Factors::Recursion, _) => {
                 if let Some(held) = &model.held {
@@ -315,9 +331,17 @@ impl KktSystem {
         }
     }
 
-    /// Takes away from multipliers what redundant equations leave open; recursions leave nothing open.
+    /// Whether constraints are eliminated by the Schur complement of all of `K`.
+    pub(crate) fn has_schur(&self) -> bool {
+        let with_joints =
+            matches!(self.factored.recursion, Recursion::Loops(_) | Recursion::Held(_));
+        self.factored.valid != Factors::Recursion || !with_joints
+    }
+
+    /// Takes away from multipliers what redundant equations leave open; where constraints are eliminated together with
+    /// joints, nothing is.
     pub(crate) fn remove_null(&self, multipliers: &mut [f64]) {
-        if self.factored.valid == Factors::Tree {
+        if self.has_schur() {
             self.schur.lu.remove_null(multipliers);
         }
     }

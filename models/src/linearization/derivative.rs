@@ -88,7 +88,7 @@ struct Formed {
 
 /// Whether the derivative of one step of the midpoint rule is by generators.
 pub(crate) fn is_generated(model: &Model, settings: &Settings) -> bool {
-    model.is_generated() && takes_split(model, settings)
+    model.dimensions.constraints == 0 && model.is_generated() && takes_split(model, settings)
 }
 
 impl StepDerivative {

@@ -38,7 +38,6 @@ use crate::integrator::scheme::Tableau;
 use crate::integrator::settings::Settings;
 use crate::integrator::workspace::{StepContext, Workspace};
 use crate::kkt::schur::room_for_schur;
-use crate::kkt::system::Factors;
 use crate::linearization::ends::{Ends, InputImpulse};
 use crate::linearization::matrices::Layout;
 use crate::model::mechanism::Model;
@@ -174,7 +173,7 @@ impl SolvedStep {
         }
         if !self.multipliers.is_empty() {
             self.multipliers.copy_from_slice(&workspace.step.multipliers);
-            self.without_schur = workspace.kkt.factored.valid == Factors::Recursion;
+            self.without_schur = !workspace.kkt.has_schur();
             if !self.without_schur {
                 self.responses.copy_from_slice(&workspace.kkt.schur.responses);
                 self.schur.take_factors_of(&workspace.kkt.schur.lu);

@@ -65,11 +65,11 @@ impl Workspace {
             columns,
             units,
         );
+        negate(&mut out.increment);
         if d.constraints > 0 {
             self.prepare_start(at.model, at.state);
             self.finish_end(at.model, at.state);
             self.factor_schur(at.model, at.settings)?;
-            self.fill_closing(at, out);
             self.solve_multipliers(at, out);
         }
         self.differentiate_momentum(at, out);
@@ -129,7 +129,38 @@ impl Workspace {
         let (increment, momentum, stride) = (&mut out.increment, &mut out.momentum, out.stride);
         in_space.write(Rows { increment, momentum, stride });
         self.kkt.in_space = Some(in_space);
-        result.map(|()| true)
+        result?;
+        if at.model.dimensions.constraints > 0 {
+            self.constrain(at, out)?;
+        }
+        Ok(true)
+    }
+
+    /// From the linearization of a tree without its constraints, makes that with them. What constraints push acts as
+    /// momentum does, so the columns of `p` tell what it makes: `x'` and `p[k+1]'` become
+    ///
+    /// ```text
+    /// x' − X_p (H q' + A0ᵀ λ')      p[k+1]' − P_p (H q' + A0ᵀ λ')      S = −A1 X_p A0ᵀ
+    /// ```
+    ///
+    /// in O(n² nc), but for the product of `X_p` and `P_p` with the second derivatives `H` of the constraints.
+    fn constrain(&mut self, at: StepContext<'_>, out: &mut Linearization) -> Result<(), StepError> {
+        let StepContext { model, settings, state, .. } = at;
+        let Settings { time_step_s, singular_below, .. } = *settings;
+        self.prepare_start(model, state);
+        self.finish_end(model, state);
+        let Self { constraints, kkt, tangents, step, .. } = self;
+        let Tangents { constraint_hessian: hessian, pushes, terms, .. } = tangents;
+        constraints.start.hessian(model, &state.q, &step.multipliers, hessian);
+        pushes.take(model, hessian, &constraints.start);
+        pushes.respond(&mut out.increment, &mut kkt.schur.responses, terms);
+        pushes.respond_in_momentum(&mut out.momentum, terms);
+        let is_regular = kkt.close_schur(model, &constraints.end, time_step_s, singular_below);
+        self.check_schur(model, is_regular)?;
+        self.solve_multipliers(at, out);
+        let Tangents { pushes, terms, .. } = &mut self.tangents;
+        pushes.add_to_momentum(&out.multipliers, &mut out.momentum, terms);
+        Ok(())
     }
 
     /// Factors by generators at the last second derivatives in space, for derivatives of the step, and finds how
@@ -264,6 +295,7 @@ impl Workspace {
         let columns = if out.nk > 0 { out.stride } else { padded(out.next_columns()) };
         let lengths = [out.stride, columns];
         limbs.solve_rows(held, &mut out.increment, &mut out.multipliers, lengths);
+        negate(&mut out.increment);
         self.differentiate_momentum(at, out);
         Ok(true)
     }
@@ -326,13 +358,9 @@ impl Workspace {
         })
     }
 
-    /// From `−x'` in `out.increment`: turns it round, and adds what depends on `x'` and `λ'` to
-    /// `out.momentum`.
+    /// Adds what depends on `x'` and `λ'` to `out.momentum`.
     pub(crate) fn differentiate_momentum(&mut self, at: StepContext<'_>, out: &mut Linearization) {
         widest!({
-            for x in out.increment.iter_mut() {
-                *x = -*x;
-            }
             let model = at.model;
             let d = model.dimensions;
             let (n, nd, stride) = (d.coordinates(), d.dynamic, out.stride);
@@ -472,29 +500,34 @@ impl Workspace {
         }
     }
 
-    /// From `K⁻¹ r1'` in `out.increment` and `r2'` in `out.multipliers`: solves `S λ' = A1 K⁻¹ r1' − r2'` and
-    /// subtracts `K⁻¹ A0ᵀ λ'`.
+    /// From `x' = −K⁻¹ r1'` in `out.increment`: solves `S λ' = −A1 x' − r2'` and adds `K⁻¹ A0ᵀ λ'`.
     fn solve_multipliers(&mut self, at: StepContext<'_>, out: &mut Linearization) {
+        self.fill_closing(at, out);
         let model = at.model;
         let d = model.dimensions;
         let (n, nc, stride) = (d.coordinates(), d.constraints, out.stride);
         for (c, constraint) in model.constraints.iter().enumerate() {
             let jacobian = &self.constraints.end.jacobian[c * n..][..n];
             let target = &mut out.multipliers[c * stride..][..stride];
-            target.iter_mut().for_each(|entry| *entry = -*entry);
+            negate(target);
             let dynamic = constraint.dynamic_coordinates().iter();
             self.tangents.terms.clear();
-            self.tangents.terms.extend(dynamic.map(|&i| (jacobian[i], i)));
+            self.tangents.terms.extend(dynamic.map(|&i| (-jacobian[i], i)));
             add_rows(target, &out.increment, stride, &self.tangents.terms);
         }
         self.kkt.schur.lu.solve_rows(&mut out.multipliers, stride);
         for (i, target) in out.increment.chunks_exact_mut(stride).enumerate() {
             let responses = self.kkt.schur.responses[i * padded(nc)..][..nc].iter().enumerate();
             self.tangents.terms.clear();
-            self.tangents.terms.extend(responses.map(|(c, r)| (-r, c)));
+            self.tangents.terms.extend(responses.map(|(c, r)| (*r, c)));
             add_rows(target, &out.multipliers, stride, &self.tangents.terms);
         }
     }
+}
+
+#[inline(always)]
+fn negate(numbers: &mut [f64]) {
+    numbers.iter_mut().for_each(|x| *x = -*x);
 }
 
 /// Whether generators have what forces at poses give to derivatives: they are those of equal halves.

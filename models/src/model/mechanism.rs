@@ -148,10 +148,16 @@ impl Solver {
     /// of its bodies took 1.47, 1.21, 0.67 and 0.27.
     const DEEP_WITH_RATES: usize = 18;
 
-    /// Whether generators are faster in space, where vectors of so many joints are three times as long.
-    pub(crate) fn is_deep(elimination: &SymbolicElimination, with_rates: usize) -> bool {
-        let more = with_rates * (Self::DEEP_WITH_RATES - Self::DEEP);
-        elimination.entries() > Self::DEEP * elimination.rows() + more
+    /// Whether generators are faster in space, where vectors of so many joints are three times as long, and so many
+    /// equations are solved with them.
+    pub(crate) fn is_deep(
+        elimination: &SymbolicElimination,
+        with_rates: usize,
+        equations: usize,
+    ) -> bool {
+        let rows = elimination.rows();
+        let more = with_rates * (Self::DEEP_WITH_RATES - Self::DEEP) + rows * equations;
+        elimination.entries() > Self::DEEP * rows + more
     }
 
     /// The fastest one for a model without loops and limbs that are held.
@@ -159,7 +165,7 @@ impl Solver {
         let d = model.dimensions;
         if model.is_generated_in_space() {
             let with_rates = if model.blocks() == Blocks::Three { model.acted_on() } else { 0 };
-            let is_deep = Self::is_deep(&model.elimination, with_rates);
+            let is_deep = Self::is_deep(&model.elimination, with_rates, d.constraints);
             return if is_deep { Self::Spatial } else { Self::Tree };
         }
         let is_free = d.constraints == 0 && d.prescribed == 0 && model.joints_are_in_order();
@@ -755,20 +761,18 @@ pub struct OperatingPoint {
 }
 
 impl Model {
-    /// Whether steps go by vectors of the joints in space: where they generate the whole Newton matrix, and it is no
-    /// tree in a plane, which is solved there.
+    /// Whether steps may go by vectors of the joints in space: where they generate the whole Newton matrix, and it is
+    /// no tree in a plane, which is solved there.
     pub(crate) fn is_generated_in_space(&self) -> bool {
         self.planar.is_none() && self.is_generated()
     }
 
-    /// Whether vectors of the joints generate the whole Newton matrix: without constraints, and what acts between
-    /// bodies of which none is above the other, or couples coordinates.
+    /// Whether vectors of the joints generate the whole Newton matrix: without what acts between bodies of which none
+    /// is above the other, or couples coordinates.
     pub(crate) fn is_generated(&self) -> bool {
-        let d = self.dimensions;
         let are_generated =
             |forces: &Forces| forces.are_generated() && !forces.act_on_balls(&self.orientations);
-        d.constraints == 0
-            && self.forces.as_ref().is_none_or(are_generated)
+        self.forces.as_ref().is_none_or(are_generated)
             && self.potentials.springs.iter().all(Spring::is_generated)
             && self.acting.is_some()
             && self.armature.iter().all(|armature| armature.row == armature.column)

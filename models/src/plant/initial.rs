@@ -399,7 +399,8 @@ impl Workspace {
         let n = model.dimensions.coordinates();
         self.prepare_start(model, state);
         let KktSystem { factored: Factored { tree, .. }, schur, .. } = &mut self.kkt;
-        schur.factor(model, tree, [&self.constraints.start; 2]);
+        schur.respond_by_tree(model, tree, &self.constraints.start);
+        schur.factor(model, &self.constraints.start);
         let rows = self.constraints.start.jacobian.chunks(n);
         for (rate, row) in self.residual.constraints.iter_mut().zip(rows) {
             let velocity = self.residual.dynamics.iter().chain(&state.v);
