@@ -122,6 +122,7 @@ fn assemble(scene: &Scene, layout: Layout) -> Model {
     let planar = if goes_to_space { None } else { planar(&dynamics, gravity) };
     let mut model = Model {
         acting: None,
+        has_ties: false,
         impulses: 0,
         foresees_elements: false,
         conditioning: Conditioning::default(),
@@ -155,7 +156,7 @@ fn assemble(scene: &Scene, layout: Layout) -> Model {
         warnings: Vec::new(),
     };
     model.impulses = model.input_pattern().count();
-    model.acting = model.find_acting();
+    model.find_elements();
     model.foresees_elements = dimensions.constraints == 0
         && model.is_generated_in_space()
         && !model.has_simple_elements();

@@ -318,6 +318,9 @@ impl Workspace {
                 }
             });
         }
+        if let Some(tied) = &kkt.tied {
+            tied.add_change([position, velocity], h, impulse);
+        }
         if let Some(fields) = &mut kkt.fields {
             let curvature = &mid.mechanics.curvature;
             fields.add_change(model, curvature, [position, velocity], h, impulse);

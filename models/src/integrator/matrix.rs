@@ -6,7 +6,7 @@ use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::Workspace;
 use crate::kkt::schur::{SchurComplement, fill_schur};
-use crate::kkt::system::{Factors, Linearized};
+use crate::kkt::system::{Factors, KktSystem, Linearized};
 use crate::lagrangian::fields::OwnTorque;
 use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::mechanics::Mechanics;
@@ -99,12 +99,10 @@ impl Workspace {
     pub(crate) fn weigh_coordinates(&mut self, model: &Model, settings: &Settings) {
         self.mid.fill_diagonal(model, settings, &mut self.kkt.diagonal);
         let weight = 2.0 * settings.force_split.at_start();
-        if let Some(fields) = self.kkt.fields.as_deref_mut() {
-            fields.evaluate(model, &self.mid.instant(model), weight);
-        }
+        self.kkt.evaluate_elements(model, &self.mid.instant(model), weight);
         if !model.orientations.is_empty() {
             self.weigh_balls(model, settings);
-            let (h, Self { mid, kkt, .. }) = (settings.time_step_s, self);
+            let (h, Self { mid, kkt, .. }) = (settings.time_step_s, &mut *self);
             let weights = &mut kkt.balls;
             mid.for_each_own_torque(
                 model,
@@ -115,6 +113,10 @@ impl Workspace {
                     *own = own.plus(&torque.times(&turned.plus(&by_velocity.scaled(0.5))));
                 },
             );
+        }
+        let KktSystem { tied, balls, .. } = &mut self.kkt;
+        if let Some(tied) = tied {
+            tied.weigh(model, balls, settings.time_step_s);
         }
     }
 

@@ -13,6 +13,7 @@ use crate::kkt::planar::Diagonals;
 use crate::kkt::pushes::Pushes;
 use crate::kkt::space::margins::OfBall;
 use crate::kkt::system::KktSystem;
+use crate::kkt::tied::TiedTangents;
 use crate::lagrangian::generators::Flanks;
 use crate::lagrangian::nudge::Nudge;
 use crate::model::mechanism::Model;
@@ -119,6 +120,8 @@ pub(crate) struct Tangents {
     pub(crate) balls: Vec<OfBall>,
     /// For linearizations by generators, with constraints.
     pub(crate) pushes: Pushes,
+    /// The same with ties.
+    pub(crate) tied: Option<Box<TiedTangents>>,
     pub(crate) terms: Vec<Term>,
 }
 
@@ -129,6 +132,16 @@ impl Tangents {
         self.end_slopes.resize(nd * nd, 0.0);
         if !model.orientations.is_empty() {
             self.flanks.resize(joints, Flanks::default());
+        }
+    }
+
+    /// Makes room for what a linearization by generators needs beside them, with rows that are so long.
+    pub(crate) fn make_room_beside_generators(&mut self, model: &Model, stride: usize) {
+        if model.dimensions.constraints > 0 {
+            self.pushes = Pushes::new(model, stride);
+        }
+        if model.has_ties {
+            self.tied = Some(Box::new(TiedTangents::new(model, stride)));
         }
     }
 }
@@ -147,12 +160,13 @@ impl Workspace {
             flanks: Vec::new(),
             balls: vec![OfBall::ZERO; model.orientations.len()],
             pushes: Pushes::default(),
+            tied: None,
             terms: Vec::with_capacity(nd.max(nc)),
         };
         if kkt.in_space.is_none() {
             tangents.make_room(model);
-        } else if nc > 0 {
-            tangents.pushes = Pushes::new(model, stride);
+        } else {
+            tangents.make_room_beside_generators(model, stride);
         }
         Self {
             response: Response::new(model),

@@ -5,7 +5,6 @@ use plantd_math::rows::padded;
 use plantd_math::tree_lu::TreeLu;
 
 use crate::constraints::closure::Closure;
-use crate::kkt::system::{Factored, Factors, Recursion};
 use crate::model::mechanism::Model;
 
 /// `S`, factored, with what it is made of.
@@ -25,19 +24,19 @@ impl SchurComplement {
         Self { responses, lu: room_for_schur(model, stride), row: vec![0.0; d.dynamic] }
     }
 
-    /// Finds `K⁻¹ A0ᵀ` by the valid factors, with the Jacobian at the start.
-    pub(crate) fn respond(&mut self, model: &Model, factored: &mut Factored, start: &Closure) {
-        let Factored { tree, recursion, valid } = factored;
-        let (Recursion::Spatial(recursion), Factors::Recursion) = (recursion, *valid) else {
-            self.respond_by_tree(model, tree, start);
-            return;
-        };
+    /// Finds `K⁻¹ A0ᵀ` with what solves, and the Jacobian at the start.
+    pub(crate) fn respond(
+        &mut self,
+        model: &Model,
+        start: &Closure,
+        mut solve: impl FnMut(&mut [f64]),
+    ) {
         let (n, nc) = (model.dimensions.coordinates(), model.dimensions.constraints);
         let Self { responses, row, .. } = self;
         for c in 0..nc {
             let jacobian = &start.jacobian[c * n..];
             row.copy_from_slice(&jacobian[..model.dimensions.dynamic]);
-            recursion.solve(row);
+            solve(row);
             let column = responses.iter_mut().skip(c).step_by(padded(nc));
             column.zip(&*row).for_each(|(response, x)| *response = *x);
         }

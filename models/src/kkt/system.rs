@@ -18,8 +18,10 @@ use crate::kkt::schur::SchurComplement;
 use crate::kkt::space::derivatives::Derivatives;
 use crate::kkt::space::margins::Own;
 use crate::kkt::space::{Added, Spatial};
+use crate::kkt::tied::Tied;
 use crate::lagrangian::fields::Fields;
 use crate::lagrangian::generators::MatrixKind;
+use crate::lagrangian::instant::Instant;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::planar::PlanarTree;
 use crate::lagrangian::turning::Weights;
@@ -43,6 +45,8 @@ pub(crate) struct KktSystem {
     pub(crate) estimates: Estimates,
     /// What acts on bodies from the world or from bodies above, where generators have that.
     pub(crate) fields: Option<Box<Fields>>,
+    /// What generators do not have of elements between bodies.
+    pub(crate) tied: Option<Box<Tied>>,
     /// For linearizations by generators in space.
     pub(crate) in_space: Option<Derivatives>,
 }
@@ -136,10 +140,12 @@ impl KktSystem {
         }
         let is_generated = in_space.is_some() || model.solver == Solver::Spatial;
         let fields = (is_generated && model.has_fields()).then(|| Box::new(Fields::new(model)));
+        let is_tied = is_generated && model.has_ties;
         Self {
             factored: Factored::new(model),
             in_space,
             fields,
+            tied: is_tied.then(|| Box::new(Tied::new(model, stride))),
             schur: SchurComplement::new(model, stride),
             diagonal: vec![0.0; nd],
             balls: vec![Weights::REST; model.orientations.len()],
@@ -214,7 +220,18 @@ impl KktSystem {
                 mechanics.differentiate(model);
                 let fields = self.fields.as_deref().filter(|_| kind == MatrixKind::Newton);
                 let added = Added { diagonal, balls: &self.balls, fields };
-                recursion.factor(model, (&mechanics.curvature, added), time_step_s, kind)
+                let pivot =
+                    recursion.factor(model, (&mechanics.curvature, added), time_step_s, kind);
+                if let Some(tied) = &mut self.tied {
+                    tied.is_idle = kind == MatrixKind::Mass;
+                    // A pivot that is too small may be one by the generators alone.
+                    if !tied.is_idle
+                        && (pivot.relative < singular_below || !tied.factor(|x| recursion.solve(x)))
+                    {
+                        return Ok(false);
+                    }
+                }
+                pivot
             }
             (Recursion::None | Recursion::Planar(_) | Recursion::Loops(_), ..) => {
                 return Ok(false);
@@ -226,6 +243,18 @@ impl KktSystem {
         } else {
             let is_free = model.constraints.is_empty();
             Ok(is_free || self.factor_schur(model, constraints, time_step_s, singular_below))
+        }
+    }
+
+    /// Finds what ties and other elements between bodies give at an instant; forces count `weight` times.
+    pub(crate) fn evaluate_elements(&mut self, model: &Model, at: &Instant<'_>, weight: f64) {
+        let mut pulls = &[][..];
+        if let Some(tied) = &mut self.tied {
+            tied.ties.evaluate(model, at, weight);
+            pulls = &tied.ties.pulls;
+        }
+        if let Some(fields) = &mut self.fields {
+            fields.evaluate(model, at, pulls, weight);
         }
     }
 
@@ -273,7 +302,13 @@ impl KktSystem {
         time_step_s: f64,
         singular_below: f64,
     ) -> bool {
-        self.schur.respond(model, &mut self.factored, start);
+        let Self { factored: Factored { tree, recursion, valid }, schur, tied, .. } = self;
+        match (recursion, *valid) {
+            (Recursion::Spatial(recursion), Factors::Recursion) => {
+                schur.respond(model, start, |x| solve_in_space(recursion, tied, x));
+            }
+            _ => schur.respond_by_tree(model, tree, start),
+        }
         self.close_schur(model, end, time_step_s, singular_below)
     }
 
@@ -312,7 +347,7 @@ impl KktSystem {
                 }
             }
             (Recursion::Spatial(recursion), Factors::Recursion, _) => {
-                recursion.solve(x);
+                solve_in_space(recursion, &mut self.tied, x);
                 if !lambda.is_empty() {
                     self.schur.close(model, end, x, lambda);
                 }
@@ -344,5 +379,13 @@ impl KktSystem {
         if self.has_schur() {
             self.schur.lu.remove_null(multipliers);
         }
+    }
+}
+
+/// Solves by generators, with the ties.
+fn solve_in_space(recursion: &mut Spatial, tied: &mut Option<Box<Tied>>, x: &mut [f64]) {
+    recursion.solve(x);
+    if let Some(tied) = tied.as_deref_mut().filter(|tied| !tied.is_idle) {
+        tied.close(x);
     }
 }

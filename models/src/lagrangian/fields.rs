@@ -32,6 +32,7 @@ use plantd_math::spatial::{Force, Mat3, Motion, Vec3};
 use crate::lagrangian::curvature::Curvature;
 use crate::lagrangian::instant::Instant;
 use crate::lagrangian::momenta::Momenta;
+use crate::lagrangian::ties::Pull;
 use crate::model::mechanism::{
     Acting, Blocks, Forces, Model, Potentials, Span, Spring, mover, span,
 };
@@ -148,12 +149,21 @@ impl Model {
     fn fields(&self, weight: f64) -> impl Iterator<Item = (Span, &dyn Field, f64)> {
         let springs = self.potentials.fields().map(|field| (field, 1.0));
         let forces = self.forces.iter().flat_map(Forces::fields).map(move |field| (field, weight));
-        springs.chain(forces).filter_map(|(field, weight)| Some((field.span()?, field, weight)))
+        let all = springs.chain(forces);
+        let spanned = all.filter_map(|(field, weight)| Some((field.span()?, field, weight)));
+        // With ties, what acts from bodies above is one of them.
+        spanned.filter(|(span, ..)| !self.has_ties || span.base == WORLD)
+    }
+
+    /// What they are between, and what the forces of ties at points are.
+    fn spans(&self) -> impl Iterator<Item = Span> {
+        let of_ties = self.tied_joints().map(|body| Span { body, base: WORLD });
+        self.fields(1.0).map(|(span, ..)| span).chain(of_ties)
     }
 
     /// Whether something does.
     pub(crate) fn has_fields(&self) -> bool {
-        self.fields(1.0).next().is_some()
+        self.spans().next().is_some()
     }
 
     /// How many blocks the vectors of its joints have.
@@ -167,11 +177,22 @@ impl Model {
         }
     }
 
+    /// Finds [`Model::acting`], and whether there are ties.
+    pub(crate) fn find_elements(&mut self) {
+        let are_generated = self.forces.as_ref().is_none_or(Forces::are_generated)
+            && self.potentials.springs.iter().all(Spring::is_generated);
+        self.acting = self.find_acting();
+        if !are_generated || self.acting.is_none() {
+            self.has_ties = true;
+            self.acting = self.find_acting();
+        }
+    }
+
     /// [`Model::acting`].
-    pub(crate) fn find_acting(&self) -> Option<Vec<Acting>> {
+    fn find_acting(&self) -> Option<Vec<Acting>> {
         let joints = &self.dynamics.joints[..];
         let mut bases = vec![None; joints.len()];
-        for (Span { body, base }, ..) in self.fields(1.0) {
+        for Span { body, base } in self.spans() {
             let mut at = body;
             // Above a joint that is between the same base and another body, all have been there.
             while at != base && bases[at] != Some(base) {
@@ -228,7 +249,7 @@ impl Fields {
     pub(crate) fn new(model: &Model) -> Self {
         let joints = &model.dynamics.joints[..];
         let mut places = vec![NOWHERE; joints.len()];
-        let acted_on = model.fields(1.0).map(|(Span { body, .. }, ..)| body);
+        let acted_on = model.spans().map(|Span { body, .. }| body);
         let apart = joints.iter().enumerate().filter(|(i, joint)| !joint.follows(*i));
         let (mut count, parents) = (0, apart.map(|(_, joint)| joint.parent));
         for joint in acted_on.chain(parents) {
@@ -243,9 +264,25 @@ impl Fields {
         Self { sums, places, given, passed, has_rates }
     }
 
-    /// Finds what joints give; forces count `weight` times.
-    pub(crate) fn evaluate(&mut self, model: &Model, at: &Instant<'_>, weight: f64) {
+    /// Finds what joints give, with the forces of ties at points; forces count `weight` times.
+    pub(crate) fn evaluate(
+        &mut self,
+        model: &Model,
+        at: &Instant<'_>,
+        pulls: &[Pull],
+        weight: f64,
+    ) {
         self.sums.fill(Sum::default());
+        for &Pull { joint, point, force } in pulls {
+            let Some(sum) = self.sums.get_mut(self.places[joint]) else { continue };
+            let Force { n, f } = at_point(point, force);
+            sum.wrench = sum.wrench.plus(six(n, f));
+            for component in 0..6 {
+                let moved = unit(component).at(point);
+                let change = change_at_point([point, force], [moved, Vec3::ZERO]);
+                add(&mut sum.by_motion, component, change);
+            }
+        }
         for (Span { body, .. }, field, weight) in model.fields(weight) {
             let place = self.places.get(body).copied().unwrap_or(NOWHERE);
             let Some(sum) = self.sums.get_mut(place) else { continue };

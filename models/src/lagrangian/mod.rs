@@ -24,5 +24,6 @@ pub(crate) mod potentials;
 pub(crate) mod samples;
 pub(crate) mod stop;
 pub(crate) mod sums;
+pub(crate) mod ties;
 pub(crate) mod turning;
 pub(crate) mod vectors;

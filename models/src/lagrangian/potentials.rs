@@ -126,7 +126,10 @@ impl Model {
                 Spring::Orientation(_) => {}
                 Spring::Coordinate(own) => own.for_each_second_derivative(at, &mut take),
                 Spring::Spline(own) => own.for_each_second_derivative(at, &mut take),
-                Spring::Linear(own) => own.for_each_second_derivative(at, &mut take),
+                Spring::Linear(own) if own.terms.len() == 1 => {
+                    own.for_each_second_derivative(at, &mut take);
+                }
+                Spring::Linear(_) => {}
                 Spring::Stop(own) => own.for_each_second_derivative(at, &mut take),
             }
         }

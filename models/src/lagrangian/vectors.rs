@@ -164,6 +164,11 @@ impl<'a, S: Scalar> Distance<'a, S> {
 }
 
 impl Distance<'_, f64> {
+    /// Its direction `e` and `1/l`; both zero where the points coincide.
+    pub(crate) fn line(&self) -> (Vec3, f64) {
+        (self.direction, self.inverse)
+    }
+
     /// Bounds of `|l_i|`, `|l_ij|` and `|l_ijk|`: with `r` the longest lever of a joint, `r`, `r (r/l + 1)` and
     /// `r (3 r²/l² + 3 r/l + 1)`. Not finite where the points coincide.
     pub(crate) fn steepness(&self) -> [f64; 3] {

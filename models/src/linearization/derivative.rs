@@ -88,7 +88,8 @@ struct Formed {
 
 /// Whether the derivative of one step of the midpoint rule is by generators.
 pub(crate) fn is_generated(model: &Model, settings: &Settings) -> bool {
-    model.dimensions.constraints == 0 && model.is_generated() && takes_split(model, settings)
+    let is_closed = model.dimensions.constraints > 0 || model.has_ties;
+    !is_closed && model.is_generated() && takes_split(model, settings)
 }
 
 impl StepDerivative {

@@ -129,11 +129,27 @@ impl Workspace {
         let (increment, momentum, stride) = (&mut out.increment, &mut out.momentum, out.stride);
         in_space.write(Rows { increment, momentum, stride });
         self.kkt.in_space = Some(in_space);
-        result?;
+        if at.model.has_ties {
+            // A pivot that is too small may be one by the generators alone.
+            if result.is_err() || !self.tie(at, out) {
+                return Ok(false);
+            }
+        } else {
+            result?;
+        }
         if at.model.dimensions.constraints > 0 {
             self.constrain(at, out)?;
         }
         Ok(true)
+    }
+
+    /// From the linearization of a tree without its ties, makes that with them; false where they are not sound.
+    fn tie(&mut self, at: StepContext<'_>, out: &mut Linearization) -> bool {
+        let Tangents { tied: tangents, terms, .. } = &mut self.tangents;
+        let (Some(tied), Some(tangents)) = (&mut self.kkt.tied, tangents) else { return false };
+        let (increment, momentum, stride) = (&mut out.increment, &mut out.momentum, out.stride);
+        let step = (&out.ends.turnings[..], at.settings.time_step_s);
+        tied.linearize(step, Rows { increment, momentum, stride }, tangents, terms)
     }
 
     /// From the linearization of a tree without its constraints, makes that with them. What constraints push acts as
@@ -159,7 +175,7 @@ impl Workspace {
         self.check_schur(model, is_regular)?;
         self.solve_multipliers(at, out);
         let Tangents { pushes, terms, .. } = &mut self.tangents;
-        pushes.add_to_momentum(&out.multipliers, &mut out.momentum, terms);
+        pushes.add_to_momentum(&mut out.momentum, &out.multipliers, terms);
         Ok(())
     }
 
@@ -533,7 +549,11 @@ fn negate(numbers: &mut [f64]) {
 /// Whether generators have what forces at poses give to derivatives: they are those of equal halves.
 pub(crate) fn takes_split(model: &Model, settings: &Settings) -> bool {
     settings.force_split == ForceSplit::Symmetric
-        || model.forces.as_ref().is_none_or(|forces| !forces.cross_balls() && !model.has_fields())
+        || !model.has_ties
+            && model
+                .forces
+                .as_ref()
+                .is_none_or(|forces| !forces.cross_balls() && !model.has_fields())
 }
 
 /// Impulses of inputs of coordinates.

@@ -59,6 +59,9 @@ pub struct Model {
     pub(crate) mixed_pairs: Vec<MixedPair>,
     /// What acts on bodies across each joint. `None` where elements act across one joint from different bodies.
     pub(crate) acting: Option<Vec<Acting>>,
+    /// Whether what acts between bodies, but for that from the world, is taken as
+    /// [ties](crate::lagrangian::ties): where generators alone do not have all of it.
+    pub(crate) has_ties: bool,
     /// How many entries [`Model::input_pattern`] has.
     pub(crate) impulses: usize,
     /// Whether the end of steps is foreseen with the springs and forces that it has beside
@@ -149,7 +152,7 @@ impl Solver {
     const DEEP_WITH_RATES: usize = 18;
 
     /// Whether generators are faster in space, where vectors of so many joints are three times as long, and so many
-    /// equations are solved with them.
+    /// equations, and rows of ties, are solved with them.
     pub(crate) fn is_deep(
         elimination: &SymbolicElimination,
         with_rates: usize,
@@ -165,7 +168,8 @@ impl Solver {
         let d = model.dimensions;
         if model.is_generated_in_space() {
             let with_rates = if model.blocks() == Blocks::Three { model.acted_on() } else { 0 };
-            let is_deep = Self::is_deep(&model.elimination, with_rates, d.constraints);
+            let is_deep =
+                Self::is_deep(&model.elimination, with_rates, d.constraints + model.tied_rows());
             return if is_deep { Self::Spatial } else { Self::Tree };
         }
         let is_free = d.constraints == 0 && d.prescribed == 0 && model.joints_are_in_order();
@@ -243,7 +247,7 @@ impl Spring {
 
 impl Spring {
     /// Whether it acts on one coordinate, or on a body from the world or from one above it, across one joint or more.
-    fn is_generated(&self) -> bool {
+    pub(crate) fn is_generated(&self) -> bool {
         match self {
             Self::Coordinate(_) | Self::Spline(_) | Self::Stop(_) | Self::Orientation(_) => true,
             Self::Point(spring) => spring.ends.span().is_some(),
@@ -767,13 +771,9 @@ impl Model {
         self.planar.is_none() && self.is_generated()
     }
 
-    /// Whether vectors of the joints generate the whole Newton matrix: without what acts between bodies of which none
-    /// is above the other, or couples coordinates.
+    /// Whether vectors of the joints generate the whole Newton matrix, but for what [ties](Self::has_ties) give.
     pub(crate) fn is_generated(&self) -> bool {
-        let are_generated =
-            |forces: &Forces| forces.are_generated() && !forces.act_on_balls(&self.orientations);
-        self.forces.as_ref().is_none_or(are_generated)
-            && self.potentials.springs.iter().all(Spring::is_generated)
+        !self.forces.as_ref().is_some_and(|forces| forces.act_on_balls(&self.orientations))
             && self.acting.is_some()
             && self.armature.iter().all(|armature| armature.row == armature.column)
             && self.joints_are_in_order()

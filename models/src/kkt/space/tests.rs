@@ -11,10 +11,10 @@ use plantd_scene::{CoordinateKind, Scene, builtin};
 use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
 use crate::integrator::workspace::Workspace;
-use crate::kkt::pushes::Pushes;
 use crate::kkt::space::Spatial;
 use crate::kkt::space::derivatives::Derivatives;
 use crate::kkt::system::{Linearized, Recursion};
+use crate::kkt::tied::Tied;
 use crate::lagrangian::fields::Fields;
 use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::samples::{prescribe, rubbing};
@@ -107,8 +107,9 @@ fn generate(workspace: &mut Workspace, model: &Model) {
     derivatives.make_room();
     workspace.kkt.in_space = Some(derivatives);
     let stride = spread(padded(2 * model.dimensions.coordinates()));
-    workspace.tangents.pushes = Pushes::new(model, stride);
+    workspace.tangents.make_room_beside_generators(model, stride);
     workspace.kkt.fields = model.has_fields().then(|| Box::new(Fields::new(model)));
+    workspace.kkt.tied = model.has_ties.then(|| Box::new(Tied::new(model, stride)));
 }
 
 /// The matrix that is filled entry by entry.
@@ -601,7 +602,83 @@ fn what_acts_from_a_body_above_is_generated() {
         assert_eq!(rope(&[["f3", "f9"], apart]).solver, Solver::Spatial);
     }
     for overlapping in [["f5", "f8"], ["f8", "f12"], ["world", "f4"]] {
-        assert_eq!(rope(&[["f3", "f9"], overlapping]).solver, Solver::Tree);
+        assert!(rope(&[["f3", "f9"], overlapping]).has_ties);
+    }
+}
+
+/// Springs and dampers of sums of coordinates.
+fn sums(names: [&str; 4]) -> String {
+    let [a, b, c, d] = names;
+    let terms = format!(
+        "terms = [{{ coordinate = \"{a}\", coefficient = 1.0 }}, {{ coordinate = \"{b}\", coefficient = -0.7 }}, \
+         {{ coordinate = \"{c}\", coefficient = 0.4 }}]"
+    );
+    let others = format!(
+        "terms = [{{ coordinate = \"{d}\", coefficient = 0.6 }}, {{ coordinate = \"{a}\", coefficient = 1.2 }}]"
+    );
+    format!(
+        "[[springs]]\ntype = \"linear_spring\"\n{terms}\nstiffness = 12.0\nrest = 0.1\n\
+         [[forces]]\ntype = \"linear_damper\"\n{others}\ndamping = 0.3\n"
+    )
+}
+
+/// What acts between bodies of which none is above the other, what is between overlapping ones, along paths over
+/// several bodies, and on sums of coordinates; with joints that are moved, ball joints, and constraints.
+#[test]
+fn what_acts_between_branches_is_tied() {
+    let tree = "gravity = [1.0, -2.0, -9.0]\ntime_step_s = 0.002";
+    let branches = [["f18", "f21"], ["f3", "f22"], ["f10", "f7"]];
+    let limbs = [["f6", "f8"], ["f4", "f3"], ["hull", "f7"]];
+    let tendon = |frames: [&str; 4]| {
+        let points =
+            frames.map(|f| format!("{{ frame = \"{f}\", at = [0.02, 0.1, -0.05] }}")).join(", ");
+        format!(
+            "[[springs]]\ntype = \"path\"\npoints = [{points}]\nstiffness = 9.0\nrest_length = 0.3\n\
+             [[forces]]\ntype = \"path_damper\"\npoints = [{points}]\ndamping = 0.5\n"
+        )
+    };
+    let ball = ["f2_rx", "f2_ry", "f2_rz"];
+    let of_branches = || branching(24, tree, "damping = 0.3");
+    let four = ["f3", "f9", "f12", "f20"];
+    let of_limbs = between(&limbs) + &tendon(["f6", "hull", "f7", "f8"]);
+    for (steps, model) in [
+        (50, pulled(&of_branches(), ["f23", "f10"], &sums(four), &[])),
+        (
+            50,
+            pulled(
+                &of_branches(),
+                ["f23", "f10"],
+                &(between(&branches) + &sums(four)),
+                &["f3", "f10"],
+            ),
+        ),
+        (
+            50,
+            pulled(
+                &of_branches(),
+                ["f1", "f0"],
+                &tendon(["f23", "f10", "f16", "world"]),
+                &["f1", "f9"],
+            ),
+        ),
+        (50, pulled(&floating(), ["hull", "hull"], &of_limbs, &[])),
+        (50, pulled(&floating(), ["f8", "f2"], &of_limbs, &["f1", "f3"])),
+        (50, pulled(&floating(), ["hull", "f2"], &of_limbs, &ball)),
+        (
+            5,
+            compiled(&rope(
+                24,
+                &(between(&[["f3", "f9"], ["f5", "f12"]]) + &tendon(["f1", "f7", "f15", "f23"])),
+            )),
+        ),
+        (50, closed(floating(), ["f8", "f7", "f6", "world"], &of_limbs, &ball)),
+    ] {
+        let model = Arc::new(model);
+        assert!(model.has_ties && model.tied_rows() > 0);
+        let mut fast = move_alike(&model, steps);
+        if model.dimensions.constraints == 0 {
+            assert_generates(&mut fast);
+        }
     }
 }
 
@@ -722,7 +799,7 @@ fn generators_are_chosen_where_they_stand_for_the_matrix() {
     chain.inputs.clear();
     chain.coordinates[0].kind = CoordinateKind::Prescribed;
     assert_eq!(Model::compile(&chain).unwrap().solver, Solver::Spatial);
-    assert_eq!(solver(on_a_sum), Solver::Tree);
+    assert_eq!(solver(on_a_sum), Solver::Spatial);
     for bushy in ["tree-30", "marionette", "spherical-pendulum"] {
         let model = Model::compile(&builtin::scene(bushy).unwrap()).unwrap();
         assert_eq!(model.solver, Solver::Tree, "{bushy}");

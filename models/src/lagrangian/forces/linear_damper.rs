@@ -28,7 +28,7 @@ impl LinearDamper {
     }
 
     /// `g` and `g'`
-    fn resistance<S: Scalar>(&self, at: &Instant<'_, S>) -> (S, S) {
+    pub(crate) fn resistance<S: Scalar>(&self, at: &Instant<'_, S>) -> (S, S) {
         let rate = self.rate(at);
         match self.law {
             LinearLaw::Damper { damping, input } => {

@@ -16,6 +16,7 @@ use crate::lagrangian::forces::GeneralizedForce;
 use crate::lagrangian::forces::linear_damper::{FRICTION_CURVE, friction};
 use crate::lagrangian::forces::point::twist;
 use crate::lagrangian::instant::Instant;
+use crate::lagrangian::ties::{Tie, Ties, tied_rows};
 use crate::lagrangian::vectors::{Distance, moving_ends, steepness_of};
 use crate::model::mechanism::{PathForce, PointPair, Resistance, Span, span};
 
@@ -132,6 +133,26 @@ impl Field for PathForce {
                 let changed = end.turned(moved) * tension - end.along * slacker;
                 change_at_point([end.point, force], [moved, changed])
             });
+        }
+    }
+}
+
+impl Tie for PathForce {
+    fn segments(&self) -> &[PointPair] {
+        &self.segments
+    }
+
+    fn rows(&self) -> usize {
+        tied_rows(&self.segments)
+    }
+
+    fn tie(&self, at: &Instant<'_>, out: &mut Ties) {
+        let Moving { rate, resistance: (c, by_length), tension } = self.moving(at);
+        let row = out.begin_row();
+        for ends in &self.segments {
+            let change =
+                |longer: f64, faster: f64| [-(by_length * rate * longer + c * faster), -c * longer];
+            out.add_segment(row, ends, at, tension, change);
         }
     }
 }

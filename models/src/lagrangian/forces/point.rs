@@ -15,8 +15,9 @@ use crate::lagrangian::fields::{Field, Take, at_point, change_at_point};
 use crate::lagrangian::forces::GeneralizedForce;
 use crate::lagrangian::forces::path::{RateBounds, along};
 use crate::lagrangian::instant::Instant;
+use crate::lagrangian::ties::{Tie, Ties};
 use crate::lagrangian::vectors::{Distance, Separation};
-use crate::model::mechanism::{Carries, PathJoint, PointForce, PointLaw, Span};
+use crate::model::mechanism::{Carries, PathJoint, PointForce, PointLaw, PointPair, Span};
 use crate::model::tree::{Attachment, WORLD};
 
 /// Points whose squared distance (m²) or speed (m²/s²) is below this coincide or rest: there is no
@@ -159,6 +160,21 @@ impl Field for PointForce {
     }
 }
 
+impl Tie for PointForce {
+    fn segments(&self) -> &[PointPair] {
+        std::slice::from_ref(&self.ends)
+    }
+
+    fn rows(&self) -> usize {
+        3
+    }
+
+    fn tie(&self, at: &Instant<'_>, out: &mut Ties) {
+        let acting = Acting::new(self, at);
+        out.add_separation(&self.ends, at, acting.force, |by, faster| acting.change(by, faster));
+    }
+}
+
 impl PointForce {
     /// `∂ḋ/∂q` of a joint on the path.
     fn rate_by_position<S: Scalar>(
@@ -183,7 +199,7 @@ impl PointForce {
 }
 
 /// Twist of what a point is fixed to.
-pub(super) fn twist<S: Scalar>(at: &Instant<'_, S>, end: &Attachment) -> Motion<S> {
+pub(crate) fn twist<S: Scalar>(at: &Instant<'_, S>, end: &Attachment) -> Motion<S> {
     if end.joint == WORLD { Motion::default() } else { at.momenta.twist_of(at.tree, end.joint) }
 }
 

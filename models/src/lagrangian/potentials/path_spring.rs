@@ -14,6 +14,7 @@ use crate::lagrangian::fields::{Field, Take, at_point, change_at_point};
 use crate::lagrangian::instant::Instant;
 use crate::lagrangian::kinematics::Place;
 use crate::lagrangian::potentials::Potential;
+use crate::lagrangian::ties::{Tie, Ties, tied_rows};
 use crate::lagrangian::vectors::{Distance, moving_ends, steepness_of};
 use crate::model::mechanism::{PathLaw, PathSpring, PointPair, Span, span};
 
@@ -75,6 +76,27 @@ impl Field for PathSpring {
                 let changed = end.turned(moved) * -tension - end.along * (stiffness * longer);
                 change_at_point([end.point, force], [moved, changed])
             });
+        }
+    }
+}
+
+impl Tie for PathSpring {
+    fn segments(&self) -> &[PointPair] {
+        &self.segments
+    }
+
+    fn rows(&self) -> usize {
+        tied_rows(&self.segments)
+    }
+
+    fn tie(&self, at: &Instant<'_>, out: &mut Ties) {
+        let Instant { tree, poses, q, .. } = *at;
+        let length = self.length(Place { tree, poses, q });
+        let (tension, stiffness) = (self.law.tension(length), self.law.stiffness(length));
+        let row = out.begin_row();
+        for ends in &self.segments {
+            let change = |longer: f64, _| [-stiffness * longer, 0.0];
+            out.add_segment(row, ends, at, -tension, change);
         }
     }
 }

@@ -14,8 +14,9 @@ use crate::lagrangian::fields::{Field, Take, at_point, change_at_point};
 use crate::lagrangian::instant::Instant;
 use crate::lagrangian::kinematics::Place;
 use crate::lagrangian::potentials::Potential;
+use crate::lagrangian::ties::{Tie, Ties};
 use crate::lagrangian::vectors::{Distance, Separation};
-use crate::model::mechanism::{Carries, PointSpring, Span};
+use crate::model::mechanism::{Carries, PointPair, PointSpring, Span};
 
 /// A two-point spring at one configuration.
 struct Stretched<S: Scalar> {
@@ -56,6 +57,25 @@ impl Field for PointSpring {
             let moved = axis.at(point);
             let changed = moved * -tension - d * (bend * d.dot(moved));
             change_at_point([point, force], [moved, changed])
+        });
+    }
+}
+
+impl Tie for PointSpring {
+    fn segments(&self) -> &[PointPair] {
+        std::slice::from_ref(&self.ends)
+    }
+
+    fn rows(&self) -> usize {
+        3
+    }
+
+    fn tie(&self, at: &Instant<'_>, out: &mut Ties) {
+        let Instant { tree, poses, q, .. } = *at;
+        let Stretched { at: separation, tension, bend } = stretched(self, Place { tree, poses, q });
+        let d = separation.difference;
+        out.add_separation(&self.ends, at, d * -tension, |by, _| {
+            by * -tension - d * (bend * d.dot(by))
         });
     }
 }
