@@ -7,8 +7,10 @@ use plantd_math::norms::larger;
 use plantd_math::scalar::{Scalar, in_registers};
 use plantd_math::spatial::{Mat3, Vec3, three};
 
+use crate::constraints::bends::{Bend, Bends};
 use crate::constraints::in_plane::InPlane;
 use crate::lagrangian::kinematics::{Place, Poses};
+use crate::lagrangian::vectors::{Distance, across};
 use crate::model::mechanism::{ConstraintKind, Length, Model, PointDistance, PointPair};
 use crate::model::tree::{JointKind, Tree};
 
@@ -38,8 +40,9 @@ pub(crate) struct Closure<S: Scalar = f64> {
     pub(crate) jacobian: Vec<S>,
     /// Change of `h` by round-off of the coordinates, from the last Jacobian.
     coordinate_round_off: Vec<S::Magnitude>,
-    /// What pulls at each joint, for second derivatives.
+    /// What pulls at each joint, for second derivatives, and what they are made of.
     pulls: Vec<Pull<S>>,
+    torques: Vec<Vec3<S>>,
     /// Of a distance, by the coordinates on the path between its ends.
     gradients: Vec<(usize, Vec3<S>)>,
     /// What is at the configuration of the last [`Closure::evaluate`].
@@ -126,6 +129,7 @@ impl<S: Scalar> Closure<S> {
             jacobian: vec![S::ZERO; nc * model.dimensions.coordinates()],
             coordinate_round_off: vec![S::Magnitude::ZERO; nc],
             pulls: vec![Pull::NONE; model.closure.joints.len()],
+            torques: vec![Vec3::ZERO; model.closure.joints.len()],
             gradients: Vec::with_capacity(model.closure.joints.len()),
             known: Known::Nothing,
             unturned: Vec::with_capacity(nc * model.orientations.len()),
@@ -270,8 +274,8 @@ impl<S: Scalar> Closure<S> {
         at.difference * factor
     }
 
-    /// Adds the second derivatives of `Σ f·p`, O(n·depth) for however many forces: with joint `i`, axis `w_i`, at
-    /// or above joint `j`, and the sums over what `j` carries,
+    /// Sums up what pulls at each joint and below it, and finds for each joint `j` what the second derivatives of `Σ f·p`
+    /// with joints `i` at or above it are made of. With their axes `w_i`, and the sums over what `j` carries,
     ///
     /// ```text
     /// w_i · Σ ∂p/∂q_j × f      hinge: Σ (w × (p − o)) × f = Σ p fᵀ w − o (F·w) − w (Σ p·f − o·F)
@@ -280,9 +284,10 @@ impl<S: Scalar> Closure<S> {
     ///
     /// Sliders above turn nothing. The axes of a ball joint turn with it: of two of them, the derivative in row `i`
     /// and column `j` is `w_j · Σ ∂p/∂q_i × f`.
-    fn add_pulls(&mut self, tree: &Tree, n: usize, out: &mut [S]) {
+    fn find_torques(&mut self, tree: &Tree) {
         for (j, joint) in tree.joints.iter().enumerate().rev() {
             let pull = self.pulls[j];
+            self.torques[j] = Vec3::ZERO;
             if !pull.is_there {
                 continue;
             }
@@ -292,14 +297,24 @@ impl<S: Scalar> Closure<S> {
             let (axis, place) = (self.poses.axis(tree, j), self.poses.place(tree, j));
             let [x, y, z] = pull.product.0;
             let along = x[0] + y[1] + z[2] - place.dot(pull.force);
-            let of_hinge = |axis: Vec3<S>| {
-                pull.product.apply(axis) - place * pull.force.dot(axis) - axis * along
-            };
-            let torque = match joint.kind {
-                JointKind::Revolute | JointKind::Ball(_) => of_hinge(axis),
+            let of_hinge =
+                || pull.product.apply(axis) - place * pull.force.dot(axis) - axis * along;
+            self.torques[j] = match joint.kind {
+                JointKind::Revolute | JointKind::Ball(_) => of_hinge(),
                 JointKind::Prismatic => axis.cross(pull.force),
-                JointKind::Screw(pitch) => of_hinge(axis) + axis.cross(pull.force).scaled(pitch),
+                JointKind::Screw(pitch) => of_hinge() + axis.cross(pull.force).scaled(pitch),
             };
+        }
+    }
+
+    /// Adds the second derivatives of `Σ f·p`, O(n·depth) for however many forces.
+    fn add_pulls(&mut self, tree: &Tree, n: usize, out: &mut [S]) {
+        self.find_torques(tree);
+        for (j, joint) in tree.joints.iter().enumerate() {
+            if !self.pulls[j].is_there {
+                continue;
+            }
+            let (axis, torque) = (self.poses.axis(tree, j), self.torques[j]);
             let own = joint.coordinate;
             let mut i = j;
             while let Some(above) = tree.joints.get(i) {
@@ -307,17 +322,71 @@ impl<S: Scalar> Closure<S> {
                     let value = self.poses.axis(tree, i).dot(torque);
                     out[own * n + above.coordinate] += value;
                     if i != j {
-                        let mirrored = if tree.one_ball(i, j) {
-                            axis.dot(of_hinge(self.poses.axis(tree, i)))
-                        } else {
-                            value
-                        };
+                        let is_one = tree.one_ball(i, j);
+                        let mirrored = if is_one { axis.dot(self.torques[i]) } else { value };
                         out[above.coordinate * n + own] += mirrored;
                     }
                 }
                 i = above.parent;
             }
         }
+    }
+}
+
+impl Closure {
+    /// Finds `Σ_c λ_c D²h_c` at `q` as products of vectors.
+    pub(crate) fn bend(&mut self, model: &Model, q: &[f64], multipliers: &[f64], out: &mut Bends) {
+        let tree = &model.closure;
+        self.pulls.fill(Pull::NONE);
+        out.begin();
+        let mut c = 0;
+        while let Some(constraint) = model.constraints.get(c) {
+            let lambda = multipliers[c];
+            match &constraint.kind {
+                ConstraintKind::Axis(equation) => {
+                    self.pull(model, &equation.points, equation.force(&multipliers[c..]));
+                }
+                ConstraintKind::Distance(PointDistance { points, .. }) => {
+                    let at = points.separation(tree, &self.poses);
+                    for axis in Mat3::<f64>::IDENTITY.0 {
+                        out.add_separation((tree, &self.poses), (points, &at), axis, 2.0 * lambda);
+                    }
+                    self.pull(model, points, at.difference * (2.0 * lambda));
+                }
+                ConstraintKind::PathLength(path) => {
+                    for points in &path.segments {
+                        let at = points.separation(tree, &self.poses);
+                        let (along, inverse) = Distance::new(points, tree, &self.poses).line();
+                        for axis in across(along) {
+                            let weight = lambda * inverse;
+                            out.add_separation((tree, &self.poses), (points, &at), axis, weight);
+                        }
+                        self.pull(model, points, along * lambda);
+                    }
+                }
+                ConstraintKind::Coupling(_) => {
+                    let at = Place { tree, poses: &self.poses, q };
+                    constraint.for_each_second_derivative(at, &mut |i, _, value| {
+                        out.add_own(i, lambda * value);
+                    });
+                }
+                // There is no room for them: see [`Bends::new`].
+                ConstraintKind::Product(_) => {}
+            }
+            c += constraint.count();
+        }
+        self.find_torques(tree);
+        let joints = tree.joints.iter().enumerate().map(|(j, joint)| Bend {
+            coordinate: joint.coordinate,
+            parent: joint.parent,
+            first: joint.first_axis(j),
+            axis: match joint.kind {
+                JointKind::Prismatic => Vec3::ZERO,
+                _ => self.poses.axis(tree, j),
+            },
+            torque: self.torques[j],
+        });
+        out.joints.extend(joints);
     }
 }
 
@@ -452,5 +521,55 @@ mod tests {
                 samples::assert_close(name, &along(closure(model, &dual).jacobian), &found);
             }
         }
+    }
+
+    /// Products of vectors, summed up entry by entry, are the second derivatives.
+    #[test]
+    fn second_derivatives_are_products_of_vectors() {
+        let mut tested = 0;
+        for model in models().iter().filter(|model| !model.constraints.is_empty()) {
+            let Some(mut bends) = Bends::new(model) else { continue };
+            let (d, n) = (model.dimensions, model.dimensions.coordinates());
+            let multipliers: Vec<f64> =
+                (0..d.constraints).map(|c| (1.3 * c as f64 + 0.5).cos()).collect();
+            for sample in 0..3 {
+                let (q, _) = samples::configuration(model, sample);
+                closure(model, &q).bend(model, &q.q, &multipliers, &mut bends);
+                let mut found = vec![0.0; n * n];
+                for (row, weight) in bends.products() {
+                    for (i, j) in (0..n * n).map(|k| (k / n, k % n)) {
+                        found[i * n + j] += weight * row[i] * row[j];
+                    }
+                }
+                let carries = |above: usize, mut joint: usize| {
+                    while joint != above && joint < bends.joints.len() {
+                        joint = bends.joints[joint].parent;
+                    }
+                    joint == above
+                };
+                for (i, row) in bends.joints.iter().enumerate() {
+                    for (j, column) in bends.joints.iter().enumerate() {
+                        let is_above = row.first != column.first && carries(i, j);
+                        let value = if is_above {
+                            row.axis.dot(column.torque)
+                        } else if row.first == column.first || carries(j, i) {
+                            column.axis.dot(row.torque)
+                        } else {
+                            continue;
+                        };
+                        found[row.coordinate * n + column.coordinate] += value;
+                    }
+                }
+                // Of a prescribed length nothing else has a row.
+                let mut expected = hessian(model, &q, &multipliers);
+                for i in d.dynamic..n {
+                    found[i * n..][..n].fill(0.0);
+                    expected[i * n..][..n].fill(0.0);
+                }
+                samples::assert_close(&model.scene.name, &found, &expected);
+                tested += 1;
+            }
+        }
+        assert!(tested > 10, "a test of little: {tested}");
     }
 }

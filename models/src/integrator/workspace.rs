@@ -10,7 +10,7 @@ use crate::integrator::response::Response;
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::kkt::planar::Diagonals;
-use crate::kkt::pushes::Pushes;
+use crate::kkt::pushes::{Bending, Pushes};
 use crate::kkt::space::margins::OfBall;
 use crate::kkt::system::KktSystem;
 use crate::kkt::tied::TiedTangents;
@@ -120,7 +120,9 @@ pub(crate) struct Tangents {
     pub(crate) balls: Vec<OfBall>,
     /// For linearizations by generators, with constraints.
     pub(crate) pushes: Pushes,
-    /// The same with ties.
+    /// `Σ λ D²h` where it bends.
+    pub(crate) bending: Option<Box<Bending>>,
+    /// For linearizations by generators, with ties.
     pub(crate) tied: Option<Box<TiedTangents>>,
     pub(crate) terms: Vec<Term>,
 }
@@ -138,7 +140,9 @@ impl Tangents {
     /// Makes room for what a linearization by generators needs beside them, with rows that are so long.
     pub(crate) fn make_room_beside_generators(&mut self, model: &Model, stride: usize) {
         if model.dimensions.constraints > 0 {
-            self.pushes = Pushes::new(model, stride);
+            self.bending = Bending::new(model, stride).map(Box::new);
+            let (nc, has_hessian) = (model.dimensions.constraints, self.bending.is_none());
+            self.pushes = Pushes::new(model, stride, nc, has_hessian);
         }
         if model.has_ties {
             self.tied = Some(Box::new(TiedTangents::new(model, stride)));
@@ -160,6 +164,7 @@ impl Workspace {
             flanks: Vec::new(),
             balls: vec![OfBall::ZERO; model.orientations.len()],
             pushes: Pushes::default(),
+            bending: None,
             tied: None,
             terms: Vec::with_capacity(nd.max(nc)),
         };

@@ -3,8 +3,11 @@
 //! It acts as momentum does, so the columns of the momentum tell what it makes of the increments, `X_p`, and of the
 //! momentum at the end, `P_p`.
 
-use plantd_math::rows::{Term, add_rows, non_zero, padded};
+use plantd_math::rows::{AlignedRows, LANES, Term, add_rows, non_zero, padded};
+use plantd_math::simd::wide;
+use plantd_math::spatial::Vec3;
 
+use crate::constraints::bends::Bends;
 use crate::constraints::closure::Closure;
 use crate::model::mechanism::Model;
 
@@ -25,19 +28,12 @@ pub(crate) struct Pushes {
 }
 
 impl Pushes {
-    /// Room for those of the constraints of a model, with rows of its linearization that are so long.
-    pub(crate) fn new(model: &Model, stride: usize) -> Self {
+    /// Room for so many multipliers, with rows of a linearization that are so long. `H` has room where it does not
+    /// [bend](Bending).
+    pub(crate) fn new(model: &Model, stride: usize, multipliers: usize, has_hessian: bool) -> Self {
         let d = model.dimensions;
-        Self::with_room(model, stride, [d.coordinates(), d.constraints])
-    }
-
-    /// Room for those of so many ties, which do not follow the start.
-    pub(crate) fn of_ties(model: &Model, stride: usize, ties: usize) -> Self {
-        Self::with_room(model, stride, [0, ties])
-    }
-
-    fn with_room(model: &Model, stride: usize, columns: [usize; 2]) -> Self {
-        let (d, [starts, multipliers]) = (model.dimensions, columns.map(padded));
+        let starts = if has_hessian { d.coordinates() } else { 0 };
+        let [starts, multipliers] = [starts, multipliers].map(padded);
         let zeros = |width: usize| vec![0.0; d.dynamic * width];
         Self {
             momentum: d.coordinates(),
@@ -50,13 +46,18 @@ impl Pushes {
         }
     }
 
-    /// Takes `H`, row-major, with the Jacobian at the start.
-    pub(crate) fn take(&mut self, model: &Model, hessian: &[f64], start: &Closure) {
+    /// Takes `H`, row-major.
+    pub(crate) fn take_hessian(&mut self, model: &Model, hessian: &[f64]) {
         let n = model.dimensions.coordinates();
-        let rows = self.by_start.chunks_exact_mut(self.starts);
+        let rows = self.by_start.chunks_exact_mut(self.starts.max(1));
         for (row, hessian) in rows.zip(hessian.chunks_exact(n)) {
             row[..n].copy_from_slice(hessian);
         }
+    }
+
+    /// Takes the Jacobian at the start.
+    pub(crate) fn take_jacobian(&mut self, model: &Model, start: &Closure) {
+        let n = model.dimensions.coordinates();
         for (c, row) in start.jacobian.chunks_exact(n).enumerate() {
             self.take_column(c, row.iter().copied());
         }
@@ -120,4 +121,109 @@ impl Pushes {
     ) {
         self.add_to(rows, &self.to_momentum, multipliers, terms);
     }
+}
+
+/// `H` as products of vectors, and room for what it takes off a linearization.
+#[derive(Clone, Debug)]
+pub(crate) struct Bending {
+    pub(crate) bends: Bends,
+    n: usize,
+    nd: usize,
+    stride: usize,
+    /// For products `s y yᵀ`: `y`, `−X_p y`, and `s yᵀ`.
+    pushes: Pushes,
+    responses: Vec<f64>,
+    weighted: AlignedRows,
+    /// Sums over what is above joints, and below them, of rows side by side.
+    above: Vec<Side3>,
+    below: Vec<Side3>,
+}
+
+/// A vector of each of some rows.
+type Side3 = [[f64; LANES]; 3];
+
+impl Bending {
+    /// Room for a model, with rows of its linearization that are so long; `None` where `H` has no such form.
+    pub(crate) fn new(model: &Model, stride: usize) -> Option<Self> {
+        let bends = Bends::new(model)?;
+        let (nd, most, joints) =
+            (model.dimensions.dynamic, bends.most(), model.closure.joints.len());
+        Some(Self {
+            n: model.dimensions.coordinates(),
+            nd,
+            stride,
+            pushes: Pushes::new(model, stride, most, false),
+            responses: vec![0.0; nd * padded(most)],
+            weighted: AlignedRows::zeros(most * stride),
+            above: vec![[[0.0; LANES]; 3]; joints],
+            below: vec![[[0.0; LANES]; 3]; joints],
+            bends,
+        })
+    }
+
+    /// Takes the products that have been found.
+    pub(crate) fn take(&mut self) {
+        for (k, (row, weight)) in self.bends.products().enumerate() {
+            self.pushes.take_column(k, row[..self.nd].iter().copied());
+            let weighted = self.weighted[k * self.stride..][..self.n].iter_mut();
+            weighted.zip(row).for_each(|(to, entry)| *to = weight * entry);
+        }
+    }
+
+    /// Takes `X_p H` off rows `X`.
+    pub(crate) fn take_off(&mut self, rows: &mut [f64], terms: &mut Vec<Term>) {
+        if !self.responses.is_empty() {
+            self.pushes.respond(rows, &mut self.responses, terms);
+            self.pushes.add_to(rows, &self.responses, &self.weighted, terms);
+        }
+        wide!({
+            let Self { bends, n, nd, stride, above, below, .. } = self;
+            let joints = &bends.joints[..];
+            for rows in rows.chunks_mut(LANES * *stride) {
+                let count = rows.len() / *stride;
+                for (j, bend) in joints.iter().enumerate() {
+                    let mut x = [0.0; LANES];
+                    if bend.coordinate < *nd {
+                        let numbers = rows[*n + bend.coordinate..].iter().step_by(*stride);
+                        x.iter_mut().zip(numbers).for_each(|(x, number)| *x = *number);
+                    }
+                    let parent = above.get(bend.parent).copied().unwrap_or_default();
+                    above[j] = parent;
+                    add_scaled(&mut above[j], bend.axis, &x);
+                    below[j] = [[0.0; LANES]; 3];
+                    add_scaled(&mut below[j], bend.torque, &x);
+                }
+                for (j, bend) in joints.iter().enumerate().rev() {
+                    let own = below[j];
+                    if let Some(parent) = below.get_mut(bend.parent) {
+                        for (parent, own) in parent.iter_mut().zip(&own) {
+                            parent.iter_mut().zip(own).for_each(|(parent, own)| *parent += own);
+                        }
+                    }
+                }
+                for bend in joints {
+                    let outside = joints[bend.first].parent;
+                    let mut taken = dot(&below[bend.first], bend.axis);
+                    if let Some(above) = above.get(outside) {
+                        let turned = dot(above, bend.torque);
+                        taken.iter_mut().zip(turned).for_each(|(taken, turned)| *taken += turned);
+                    }
+                    let entries = rows[bend.coordinate..].iter_mut().step_by(*stride);
+                    entries.zip(taken).take(count).for_each(|(entry, taken)| *entry -= taken);
+                }
+            }
+        });
+    }
+}
+
+#[inline(always)]
+fn add_scaled(to: &mut Side3, Vec3(vector): Vec3, x: &[f64; LANES]) {
+    for (to, entry) in to.iter_mut().zip(vector) {
+        to.iter_mut().zip(x).for_each(|(to, x)| *to += entry * x);
+    }
+}
+
+#[inline(always)]
+fn dot([x, y, z]: &Side3, Vec3([a, b, c]): Vec3) -> [f64; LANES] {
+    std::array::from_fn(|i| a * x[i] + b * y[i] + c * z[i])
 }

@@ -132,9 +132,10 @@ impl KktSystem {
     pub(crate) fn new(model: &Model, stride: usize) -> Self {
         let nd = model.dimensions.dynamic;
         let entries = model.elimination.entries();
+        let is_closed = model.dimensions.constraints > 0 || model.has_ties;
         let mut in_space = (model.is_generated_in_space())
             .then(|| Derivatives::new(model))
-            .filter(|own| own.is_faster(entries));
+            .filter(|own| own.is_faster(entries, is_closed));
         if let Some(in_space) = &mut in_space {
             in_space.make_room();
         }

@@ -21,7 +21,7 @@ use plantd_math::spatial::Vec3;
 
 use crate::lagrangian::forces::point::twist;
 use crate::lagrangian::instant::Instant;
-use crate::lagrangian::vectors::Distance;
+use crate::lagrangian::vectors::{Distance, across};
 use crate::model::mechanism::{Forces, Model, Potentials, Spring, mover, span};
 use crate::model::mechanism::{LinearDamper, LinearSpring, PointPair};
 use crate::model::tree::WORLD;
@@ -276,22 +276,6 @@ impl Ties {
             }
         }
     }
-}
-
-/// Two directions across one, of length 1 each.
-fn across(along: Vec3) -> [Vec3; 2] {
-    let Vec3([x, y, z]) = along;
-    let least = if x.abs() <= y.abs().min(z.abs()) {
-        Vec3([1.0, 0.0, 0.0])
-    } else if y.abs() <= z.abs() {
-        Vec3([0.0, 1.0, 0.0])
-    } else {
-        Vec3([0.0, 0.0, 1.0])
-    };
-    let first = along.cross(least);
-    let length = first.norm();
-    let first = if length > 0.0 { first * (1.0 / length) } else { Vec3::ZERO };
-    [first, along.cross(first)]
 }
 
 impl Tie for LinearSpring {

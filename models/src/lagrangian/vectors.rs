@@ -178,6 +178,22 @@ impl Distance<'_, f64> {
     }
 }
 
+/// Two directions across one, of length 1 each.
+pub(crate) fn across(along: Vec3) -> [Vec3; 2] {
+    let Vec3([x, y, z]) = along;
+    let least = if x.abs() <= y.abs().min(z.abs()) {
+        Vec3([1.0, 0.0, 0.0])
+    } else if y.abs() <= z.abs() {
+        Vec3([0.0, 1.0, 0.0])
+    } else {
+        Vec3([0.0, 0.0, 1.0])
+    };
+    let first = along.cross(least);
+    let length = first.norm();
+    let first = if length > 0.0 { first * (1.0 / length) } else { Vec3::ZERO };
+    [first, along.cross(first)]
+}
+
 impl PointPair {
     /// The farthest that one joint moves the points against each other, by a unit of its coordinate.
     pub(crate) fn lever(&self, tree: &Tree, poses: &Poses, at: &Separation) -> f64 {

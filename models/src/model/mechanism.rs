@@ -159,7 +159,7 @@ impl Solver {
         equations: usize,
     ) -> bool {
         let rows = elimination.rows();
-        let more = with_rates * (Self::DEEP_WITH_RATES - Self::DEEP) + rows * equations;
+        let more = with_rates * (Self::DEEP_WITH_RATES - Self::DEEP) + rows * equations / 2;
         elimination.entries() > Self::DEEP * rows + more
     }
 

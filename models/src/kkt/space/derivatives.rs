@@ -69,7 +69,9 @@ impl<const B: usize> Eliminated<B> {
     /// and with three                     rope of 16 8   rope of 24 12   rope of 32 16   rope of 64 32
     /// time                                        1.8             1.4            1.25            0.55
     /// ```
-    fn is_faster_by_columns(&self, entries: usize) -> bool {
+    ///
+    /// With constraints or ties, which are `closed` by the columns of the momentum, it takes some more joints.
+    fn is_faster_by_columns(&self, entries: usize, is_closed: bool) -> bool {
         let SpatialRecursion { limbs, groups, .. } = &self.recursion;
         let least = |limb: &Limb| match B {
             2 if limb.is_acted_on => 48,
@@ -77,7 +79,8 @@ impl<const B: usize> Eliminated<B> {
             _ => 31,
         };
         let axes = |limb: &Limb| groups[limb.groups.clone()].iter().map(|group| group.axes.len());
-        let all = limbs.iter().map(|limb| least(limb) * (1 + axes(limb).sum::<usize>()));
+        let more = if is_closed { 50 } else { 0 };
+        let all = limbs.iter().map(|limb| (more + least(limb)) * (1 + axes(limb).sum::<usize>()));
         10 * entries > all.sum()
     }
 }
@@ -127,8 +130,8 @@ impl Derivatives {
     }
 
     /// Whether all of them take less time than with so many entries in each triangle of the Newton matrix.
-    pub(crate) fn is_faster(&self, entries: usize) -> bool {
-        of_any!(self, own => own.is_faster_by_columns(entries))
+    pub(crate) fn is_faster(&self, entries: usize, is_closed: bool) -> bool {
+        of_any!(self, own => own.is_faster_by_columns(entries, is_closed))
     }
 
     /// Factors at the second derivatives of the bodies.

@@ -671,7 +671,7 @@ fn what_acts_between_branches_is_tied() {
                 &(between(&[["f3", "f9"], ["f5", "f12"]]) + &tendon(["f1", "f7", "f15", "f23"])),
             )),
         ),
-        (50, closed(floating(), ["f8", "f7", "f6", "world"], &of_limbs, &ball)),
+        (50, closed(floating(), Joined::AtPoint, ["f8", "f7", "f6", "world"], &of_limbs, &ball)),
     ] {
         let model = Arc::new(model);
         assert!(model.has_ties && model.tied_rows() > 0);
@@ -682,29 +682,53 @@ fn what_acts_between_branches_is_tied() {
     }
 }
 
-/// A scene with equations that its initial configuration satisfies: a point of a body is pinned to another one, and two
-/// are a distance apart. Some coordinates are moved, and all is by the tree or by generators.
-fn closed(model: Model, frames: [&str; 4], more: &str, moved: &[&str]) -> Model {
-    let model = Arc::new(model);
+/// How two bodies hang together at a point.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Joined {
+    AtPoint,
+    InPlane,
+}
+
+/// A scene with equations that its initial configuration satisfies: a point of a body is joined to another one, two are
+/// a distance apart, and a cable runs over three. Some coordinates are moved, and all is by the tree or by generators.
+fn closed(model: Model, joined: Joined, frames: [&str; 4], more: &str, moved: &[&str]) -> Model {
+    let mut scene = model.scene().clone();
+    prescribe(&mut scene, moved);
+    let model = Arc::new(Model::compile(&scene).unwrap());
     let plant = Plant::new(Arc::clone(&model), Settings::new(&model)).unwrap();
     let place = |frame: &str, at: [f64; 3]| {
         let Pose { position, rotation } = plant.pose(&model.site(frame, at).unwrap());
         (Vector3::from(position), Rotation3::new(Vector3::from(rotation)))
     };
     let [a, b, c, d] = frames;
-    let (pinned, (base, turned)) = (place(a, [0.0, 0.0, -0.05]).0, place(b, [0.0; 3]));
-    let there: [f64; 3] = (turned.inverse() * (pinned - base)).into();
-    let length = (place(c, [0.1, 0.0, 0.0]).0 - place(d, [0.0, 0.2, 0.1]).0).norm();
-    let equations = format!(
-        "[[constraints]]\nname = \"pinned\"\ntype = \"point_to_point\"\naxes = [\"x\", \"y\", \"z\"]\n\
-         a = {{ frame = \"{a}\", at = [0.0, 0.0, -0.05] }}\nb = {{ frame = \"{b}\", at = {there:?} }}\n\
-         [[constraints]]\nname = \"rod\"\ntype = \"distance\"\nlength = {length:?}\n\
-         a = {{ frame = \"{c}\", at = [0.1, 0.0, 0.0] }}\nb = {{ frame = \"{d}\", at = [0.0, 0.2, 0.1] }}\n"
-    );
-    let mut scene = Scene::from_toml(&(model.scene().to_toml() + &equations + more)).unwrap();
-    prescribe(&mut scene, moved);
-    let mut model = Model::compile(&scene).unwrap();
-    assert!(model.dimensions.constraints == 4 && model.loops.is_none());
+    let ends = [(a, [0.0, 0.0, -0.05]), (c, [0.1, 0.0, 0.0]), (d, [0.0, 0.2, 0.1])];
+    let [first, second, third] = ends.map(|(frame, at)| place(frame, at).0);
+    let (base, turned) = place(b, [0.0; 3]);
+    let there: [f64; 3] = (turned.inverse() * (first - base)).into();
+    let [p, q, r] = ends.map(|(frame, at)| format!("{{ frame = \"{frame}\", at = {at:?} }}"));
+    let join = match joined {
+        Joined::AtPoint => format!(
+            "type = \"point_to_point\"\naxes = [\"x\", \"y\", \"z\"]\n\
+             a = {p}\nb = {{ frame = \"{b}\", at = {there:?} }}"
+        ),
+        Joined::InPlane => format!(
+            "type = \"point_on_plane\"\npoint = {p}\n\
+             plane = {{ frame = \"{b}\", at = {there:?}, normal = [0.3, -0.5, 0.8] }}"
+        ),
+    };
+    let (rod, cable) = ((second - third).norm(), (first - second).norm() + (second - third).norm());
+    let equations = match joined {
+        Joined::AtPoint => format!(
+            "[[constraints]]\nname = \"rod\"\ntype = \"distance\"\nlength = {rod:?}\na = {q}\nb = {r}\n"
+        ),
+        Joined::InPlane => format!(
+            "[[constraints]]\nname = \"cable\"\ntype = \"path_length\"\nlength = {cable:?}\npoints = [{p}, {q}, {r}]\n"
+        ),
+    };
+    let text =
+        model.scene().to_toml() + &equations + "[[constraints]]\nname = \"joined\"\n" + &join;
+    let mut model = compiled(&(text + "\n" + more));
+    assert!(model.dimensions.constraints > 1 && model.loops.is_none());
     if model.held.take().is_some() {
         model.solver = Solver::Tree;
     }
@@ -722,15 +746,18 @@ fn constraints_are_closed_by_generators() {
     for i in 0..32 {
         bent += &format!("[[coordinates]]\nname = \"f{i}\"\ninitial = {}\n", 0.1 * wave(i));
     }
-    let rope = closed(compiled(&bent), ["f31", "world", "f20", "f4"], "", &[]);
+    let rope = closed(compiled(&bent), Joined::AtPoint, ["f31", "world", "f20", "f4"], "", &[]);
     assert_eq!(rope.solver, Solver::Spatial);
     let sprung = fields(["f23", "f10"]);
+    let (at_point, in_plane) = (Joined::AtPoint, Joined::InPlane);
     for model in [
         rope,
-        closed(branches("damping = 0.3"), ["f21", "f22", "f17", "world"], "", &[]),
-        closed(branches(""), ["f21", "world", "f17", "f12"], &sprung, &["f2", "f9"]),
-        closed(floating(), ["f8", "f7", "f6", "world"], "", &[]),
-        closed(floating(), ["f6", "world", "f8", "f7"], "", &ball),
+        closed(branches("damping = 0.3"), at_point, ["f21", "f22", "f17", "world"], "", &[]),
+        closed(branches(""), at_point, ["f21", "world", "f17", "f12"], &sprung, &["f2", "f9"]),
+        closed(branches(""), in_plane, ["f21", "f12", "f17", "f22"], &sprung, &["f2", "f9"]),
+        closed(floating(), at_point, ["f8", "f7", "f6", "world"], "", &[]),
+        closed(floating(), in_plane, ["f8", "f7", "f6", "world"], "", &[]),
+        closed(floating(), at_point, ["f6", "world", "f8", "f7"], "", &ball),
     ] {
         move_alike(&Arc::new(model), 50);
     }
