@@ -1,15 +1,16 @@
 //! How the time of a step, of A and B, of products with them, and the memory of a plant grow with a rope in space that has what sends other
 //! programs to dense matrices: a top that is moved, a ball joint, and a spring from its tip to the world.
 //!
-//! `cargo run --release -p plantd-models --example growth`, with `-- braced` for springs all along, each over two of
-//! the joints, in place of the one to the world
+//! `cargo run --release -p plantd-models --example growth`; in place of the spring to the world, with `-- braced` springs
+//! all along, each over two of the joints, with `-- tied` an elastic tendon over five rods, and with `-- pinned` a tip
+//! that is held where it is
 
 use std::error::Error;
 use std::hint::black_box;
 use std::sync::Arc;
 
 use plantd_models::{
-    Layout, Linearization, Model, Plant, Scene, Settings, StepDerivative, StepError,
+    Initial, Layout, Linearization, Model, Plant, Scene, Settings, Spare, StepDerivative, StepError,
 };
 
 /// Joints; the ball joint has three.
@@ -17,7 +18,7 @@ const SIZES: [usize; 4] = [64, 128, 256, 512];
 
 /// Thin rods, 1 m and 1 kg together, hinged about x and y by turns below a slide that is moved. The last one has a ball
 /// joint.
-fn rope(joints: usize, is_braced: bool) -> Result<Scene, Box<dyn Error>> {
+fn rope(joints: usize, kind: &str) -> Result<Scene, Box<dyn Error>> {
     let rods = joints - 2;
     let length = 1.0 / rods as f64;
     let across = length.powi(3) / 12.0;
@@ -45,18 +46,33 @@ fn rope(joints: usize, is_braced: bool) -> Result<Scene, Box<dyn Error>> {
     text += "[[coordinates]]\nname = \"rod0\"\nkind = \"prescribed\"\n\
              [[coordinates]]\nname = \"rod1\"\ninitial = 0.2\n\
              [[coordinates]]\nname = \"rod2\"\ninitial = 0.2\n";
-    let mut spring = |rod: usize, end: &str| {
-        text += &format!(
+    let spring = |rod: usize, end: &str| {
+        format!(
             "[[springs]]\ntype = \"two_point\"\na = {{ frame = \"rod{rod}\" }}\n\
              b = {{ {end} }}\nstiffness = 2.0\n"
-        );
+        )
     };
-    if is_braced {
-        for rod in (3..rods).step_by(2) {
-            spring(rod, &format!("frame = \"rod{}\", at = [0.01, 0.02, 0.0]", rod - 2));
+    match kind {
+        "braced" => (3..rods).step_by(2).for_each(|rod| {
+            text += &spring(rod, &format!("frame = \"rod{}\", at = [0.01, 0.02, 0.0]", rod - 2));
+        }),
+        "tied" => {
+            let rods = [1, rods / 4, rods / 2, 3 * rods / 4, rods - 1];
+            let points =
+                rods.map(|rod| format!("{{ frame = \"rod{rod}\", at = [0.02, 0.0, 0.0] }}"));
+            text += &format!(
+                "[[springs]]\ntype = \"path\"\npoints = [{}]\nstiffness = 2.0\nrest_length = 0.9\n",
+                points.join(", ")
+            );
         }
-    } else {
-        spring(rods - 1, "frame = \"world\", at = [0.0, 0.0, -1.2]");
+        "pinned" => {
+            text += &format!(
+                "[[constraints]]\nname = \"tip\"\ntype = \"point_to_point\"\naxes = [\"x\", \"y\", \"z\"]\n\
+                 a = {{ frame = \"rod{}\" }}\nb = {{ frame = \"world\", at = [0.1, 0.2, -0.8] }}\n",
+                rods - 1
+            );
+        }
+        _ => text += &spring(rods - 1, "frame = \"world\", at = [0.0, 0.0, -1.2]"),
     }
     Ok(Scene::from_toml(&text)?)
 }
@@ -109,16 +125,24 @@ fn exponent(numbers: &[f64]) -> f64 {
 }
 
 fn main() -> Result<(), Box<dyn Error>> {
-    let is_braced = std::env::args().nth(1).is_some_and(|more| more == "braced");
+    let kind = std::env::args().nth(1).unwrap_or_default();
     let mut all: [Vec<f64>; 6] = Default::default();
     println!(
         "µs       step   + A and B   + derivative as map   a product   transposed   plant, KiB"
     );
     for joints in SIZES {
-        let model = Arc::new(Model::compile(&rope(joints, is_braced)?)?);
+        let model = Arc::new(Model::compile(&rope(joints, &kind)?)?);
         let settings = Settings::new(&model);
-        let mut plant = Plant::new(Arc::clone(&model), settings)?;
         let d = model.dimensions();
+        let spare = Spare::new(Arc::clone(&model), settings)?;
+        let mut plant = if d.constraints == 0 {
+            spare.start(&Initial::Scene)?
+        } else {
+            // A bent rope, whose tip goes where it is held.
+            let bent = |i: usize| if i + 1 < d.coordinates() { 4.0 / joints as f64 } else { 0.0 };
+            let q = (0..d.coordinates()).map(bent).collect();
+            spare.start(&Initial::Projection { q, hold: Vec::new() })?
+        };
         // The first steps from rest need more corrections, the more joints there are.
         for _ in 0..100 {
             let top = top(&plant);

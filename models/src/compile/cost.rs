@@ -53,14 +53,15 @@ impl Model {
                     Blocks::Two => (2950.0, 77.0),
                     Blocks::Three => (7850.0, 154.0),
                 };
-                let acted_on = self.acted_on() as f64;
-                (
-                    100.0 + 1350.0 * joints + more * acted_on,
-                    110.0 + 93.0 * joints + correction * acted_on,
-                )
+                let (acted_on, ties) = (self.acted_on() as f64, self.tied_rows() as f64);
+                let solution = 110.0 + 93.0 * joints + correction * acted_on;
+                // Each row of a tie is solved for, and met with all others.
+                let closing = ties * (solution + nd * (40.0 + ties)) + 2.0 * ties.powi(3);
+                (100.0 + 1350.0 * joints + more * acted_on + closing, solution + 1.5 * nd * ties)
             }
         };
-        let schur = 800.0 + 165.0 * nd * nc + 2.0 * nc.powi(3);
+        let responses = if self.solver == Solver::Spatial { correction } else { 165.0 * nd };
+        let schur = 800.0 + responses * nc + 2.0 * nc.powi(3);
         let jacobian = 71.0 * support.iter().sum::<f64>();
         // Equations along world axes share what their second derivatives are made of.
         let alone = self.constraints.iter().zip(&support);

@@ -83,7 +83,16 @@ impl Model {
                 } else {
                     ""
                 };
-                format!("factorization by generators{fields}, {} joints, {islands}", joints.len())
+                let ties = match self.tied_rows() {
+                    rows if rows > 0 && self.solver == Solver::Spatial => {
+                        format!(", {rows} rows of ties")
+                    }
+                    _ => String::new(),
+                };
+                format!(
+                    "factorization by generators{fields}{ties}, {} joints, {islands}",
+                    joints.len()
+                )
             }
         });
     }
