@@ -11,7 +11,7 @@ use crate::model::mechanism::{ConstraintKind, Model, PointPair};
 use crate::model::tree::{Tree, WORLD};
 
 /// What a joint gives.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Bend {
     pub(crate) coordinate: usize,
     pub(crate) parent: usize,
@@ -32,6 +32,8 @@ pub(crate) struct Bends {
     /// `y`, and each with its `s`.
     rows: Vec<f64>,
     weights: Vec<f64>,
+    /// How many products there are so far.
+    filled: usize,
 }
 
 impl Bends {
@@ -50,15 +52,16 @@ impl Bends {
         }
         Some(Self {
             n,
-            joints: Vec::with_capacity(model.closure.joints.len()),
-            rows: Vec::with_capacity(n * count),
-            weights: Vec::with_capacity(count),
+            joints: vec![Bend::default(); model.closure.joints.len()],
+            rows: vec![0.0; n * count],
+            weights: vec![0.0; count],
+            filled: 0,
         })
     }
 
-    /// The largest number of products.
-    pub(crate) fn most(&self) -> usize {
-        self.weights.capacity()
+    /// How many products there are.
+    pub(crate) fn count(&self) -> usize {
+        self.weights.len()
     }
 
     /// `y`, each with its `s`.
@@ -67,9 +70,7 @@ impl Bends {
     }
 
     pub(super) fn begin(&mut self) {
-        self.joints.clear();
-        self.rows.clear();
-        self.weights.clear();
+        self.filled = 0;
     }
 
     /// Adds a product of how the separation of two points changes along an axis.
@@ -97,9 +98,10 @@ impl Bends {
     }
 
     fn begin_row(&mut self, weight: f64) -> &mut [f64] {
-        let start = self.rows.len();
-        self.rows.resize(start + self.n, 0.0);
-        self.weights.push(weight);
-        &mut self.rows[start..]
+        let row = &mut self.rows[self.filled * self.n..][..self.n];
+        row.fill(0.0);
+        self.weights[self.filled] = weight;
+        self.filled += 1;
+        row
     }
 }

@@ -386,7 +386,7 @@ impl Closure {
             },
             torque: self.torques[j],
         });
-        out.joints.extend(joints);
+        out.joints.iter_mut().zip(joints).for_each(|(to, joint)| *to = joint);
     }
 }
 

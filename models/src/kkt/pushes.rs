@@ -91,9 +91,9 @@ impl Pushes {
         self.to_momentum = responses;
     }
 
-    /// What is remembered, a row for each momentum, and their length.
-    pub(crate) fn of_momentum(&mut self) -> (&mut [f64], usize) {
-        (&mut self.to_momentum, self.multipliers)
+    /// What is remembered, a row for each momentum.
+    pub(crate) fn of_momentum(&mut self) -> &mut [f64] {
+        &mut self.to_momentum
     }
 
     /// Adds to rows what derivatives of the multipliers make of them, by responses.
@@ -146,15 +146,15 @@ impl Bending {
     /// Room for a model, with rows of its linearization that are so long; `None` where `H` has no such form.
     pub(crate) fn new(model: &Model, stride: usize) -> Option<Self> {
         let bends = Bends::new(model)?;
-        let (nd, most, joints) =
-            (model.dimensions.dynamic, bends.most(), model.closure.joints.len());
+        let (nd, count, joints) =
+            (model.dimensions.dynamic, bends.count(), model.closure.joints.len());
         Some(Self {
             n: model.dimensions.coordinates(),
             nd,
             stride,
-            pushes: Pushes::new(model, stride, most, false),
-            responses: vec![0.0; nd * padded(most)],
-            weighted: AlignedRows::zeros(most * stride),
+            pushes: Pushes::new(model, stride, count, false),
+            responses: vec![0.0; nd * padded(count)],
+            weighted: AlignedRows::zeros(count * stride),
             above: vec![[[0.0; LANES]; 3]; joints],
             below: vec![[[0.0; LANES]; 3]; joints],
             bends,

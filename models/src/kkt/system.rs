@@ -252,7 +252,7 @@ impl KktSystem {
         let mut pulls = &[][..];
         if let Some(tied) = &mut self.tied {
             tied.ties.evaluate(model, at, weight);
-            pulls = &tied.ties.pulls;
+            pulls = tied.ties.pulls();
         }
         if let Some(fields) = &mut self.fields {
             fields.evaluate(model, at, pulls, weight);

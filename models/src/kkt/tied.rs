@@ -153,7 +153,7 @@ impl Tied {
         }
         pushes.respond(increment, increments, terms);
         pushes.respond_in_momentum(momentum, terms);
-        let (in_momentum, _) = pushes.of_momentum();
+        let in_momentum = pushes.of_momentum();
         for (t, (row, pushes)) in self.ties.rows().zip(self.pushes.chunks_exact(nd)).enumerate() {
             let column = in_momentum.iter_mut().skip(t).step_by(width);
             for (to, (entry, push)) in column.zip(row.iter().zip(pushes)) {

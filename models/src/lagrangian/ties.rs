@@ -22,8 +22,9 @@ use plantd_math::spatial::Vec3;
 use crate::lagrangian::forces::point::twist;
 use crate::lagrangian::instant::Instant;
 use crate::lagrangian::vectors::{Distance, across};
-use crate::model::mechanism::{Forces, Model, Potentials, Spring, mover, span};
-use crate::model::mechanism::{LinearDamper, LinearSpring, PointPair};
+use crate::model::mechanism::{
+    Forces, LinearDamper, LinearSpring, Model, PointPair, Potentials, Spring, mover, span,
+};
 use crate::model::tree::WORLD;
 
 /// An element whose second derivatives are such products.
@@ -39,7 +40,7 @@ pub(crate) trait Tie {
 }
 
 /// A force of constant direction at a point of a body, from the world.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Pull {
     pub(crate) joint: usize,
     pub(crate) point: Vec3,
@@ -53,7 +54,7 @@ struct Moved {
     faster: Vec3,
 }
 
-/// A row: how `y` changes with the coordinate, and `T` with it and its velocity.
+/// An entry of a row: how `y` changes with the coordinate, and `T` with it and its velocity.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Entry {
     pub(crate) length: f64,
@@ -67,7 +68,10 @@ pub(crate) struct Ties {
     /// Coordinates, the length of a row.
     n: usize,
     rows: Vec<Entry>,
-    pub(crate) pulls: Vec<Pull>,
+    pulls: Vec<Pull>,
+    /// How many rows and pulls there are so far.
+    filled: usize,
+    pulled: usize,
     /// What forces count; of springs 1.
     weight: f64,
     moved: Vec<Moved>,
@@ -142,8 +146,10 @@ impl Ties {
         let count = model.tied_rows();
         Self {
             n,
-            rows: Vec::with_capacity(n * count),
-            pulls: Vec::with_capacity(model.tied_joints().count()),
+            rows: vec![Entry::default(); n * count],
+            pulls: vec![Pull::default(); model.tied_joints().count()],
+            filled: 0,
+            pulled: 0,
             weight: 1.0,
             moved: vec![Moved::default(); n],
         }
@@ -151,8 +157,7 @@ impl Ties {
 
     /// Finds all rows; forces count `weight` times.
     pub(crate) fn evaluate(&mut self, model: &Model, at: &Instant<'_>, weight: f64) {
-        self.rows.clear();
-        self.pulls.clear();
+        (self.filled, self.pulled) = (0, 0);
         for (tie, weight) in model.ties(weight) {
             self.weight = weight;
             tie.tie(at, self);
@@ -162,6 +167,11 @@ impl Ties {
     /// A row each, of all coordinates.
     pub(crate) fn rows(&self) -> impl ExactSizeIterator<Item = &[Entry]> {
         self.rows.chunks_exact(self.n)
+    }
+
+    /// The forces at points.
+    pub(crate) fn pulls(&self) -> &[Pull] {
+        &self.pulls[..self.pulled]
     }
 
     /// Finds how the separation of two points changes with each coordinate.
@@ -174,8 +184,8 @@ impl Ties {
                 let axis = at.momenta.axis_of(at.tree, joint);
                 let rate = at.momenta.axis_rate_of(at.tree, joint);
                 let own = &mut self.moved[at.tree.joints[joint].coordinate];
-                own.by = own.by + axis.at(point) * sign;
-                own.faster = own.faster + (rate.at(point) + axis.w.cross(velocity)) * sign;
+                own.by += axis.at(point) * sign;
+                own.faster += (rate.at(point) + axis.w.cross(velocity)) * sign;
                 joint = at.tree.joints[joint].parent;
             }
         }
@@ -183,8 +193,9 @@ impl Ties {
 
     /// Begins a row, to which nothing is added yet.
     pub(crate) fn begin_row(&mut self) -> usize {
-        let start = self.rows.len();
-        self.rows.resize(start + self.n, Entry::default());
+        let start = self.filled * self.n;
+        self.rows[start..start + self.n].fill(Entry::default());
+        self.filled += 1;
         start
     }
 
@@ -272,7 +283,8 @@ impl Ties {
             [(ends.a.joint, separation.a, force), (ends.b.joint, separation.b, -force)]
         {
             if joint != WORLD {
-                self.pulls.push(Pull { joint, point, force });
+                self.pulls[self.pulled] = Pull { joint, point, force };
+                self.pulled += 1;
             }
         }
     }

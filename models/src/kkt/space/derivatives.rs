@@ -70,7 +70,7 @@ impl<const B: usize> Eliminated<B> {
     /// time                                        1.8             1.4            1.25            0.55
     /// ```
     ///
-    /// With constraints or ties, which are `closed` by the columns of the momentum, it takes some more joints.
+    /// Where constraints or ties are closed by the columns of the momentum, it takes some more joints.
     fn is_faster_by_columns(&self, entries: usize, is_closed: bool) -> bool {
         let SpatialRecursion { limbs, groups, .. } = &self.recursion;
         let least = |limb: &Limb| match B {
