@@ -19,12 +19,9 @@
 
 use plantd_math::spatial::Vec3;
 
-use crate::lagrangian::forces::point::twist;
 use crate::lagrangian::instant::Instant;
 use crate::lagrangian::vectors::{Distance, across};
-use crate::model::mechanism::{
-    Forces, LinearDamper, LinearSpring, Model, PointPair, Potentials, Spring, mover, span,
-};
+use crate::model::mechanism::{Forces, Model, PointPair, Potentials, Spring, mover, span};
 use crate::model::tree::WORLD;
 
 /// An element whose second derivatives are such products.
@@ -179,7 +176,7 @@ impl Ties {
         self.moved.fill(Moved::default());
         let separation = ends.separation(at.tree, at.poses);
         for (end, point, sign) in [(&ends.a, separation.a, 1.0), (&ends.b, separation.b, -1.0)] {
-            let (mut joint, velocity) = (end.joint, twist(at, end).at(point));
+            let (mut joint, velocity) = (end.joint, at.twist(end).at(point));
             while joint != WORLD {
                 let axis = at.momenta.axis_of(at.tree, joint);
                 let rate = at.momenta.axis_rate_of(at.tree, joint);
@@ -246,7 +243,7 @@ impl Ties {
         }
         let (along, inverse) = Distance::new(ends, at.tree, at.poses).line();
         let separation = ends.separation(at.tree, at.poses);
-        let velocity = twist(at, &ends.a).at(separation.a) - twist(at, &ends.b).at(separation.b);
+        let velocity = at.twist(&ends.a).at(separation.a) - at.twist(&ends.b).at(separation.b);
         let turned = (velocity - along * along.dot(velocity)) * inverse;
         self.move_ends(ends, at);
         self.add_to(length, |Moved { by, faster }| {
@@ -265,7 +262,7 @@ impl Ties {
     }
 
     /// Adds a row of a sum of coordinates, `T` of which changes with the sum and its rate.
-    fn add_sum(&mut self, terms: &[(usize, f64)], [by_position, by_velocity]: [f64; 2]) {
+    pub(crate) fn add_sum(&mut self, terms: &[(usize, f64)], [by_position, by_velocity]: [f64; 2]) {
         let start = self.begin_row();
         for &(i, c) in terms {
             let row = &mut self.rows[start + i];
@@ -287,34 +284,5 @@ impl Ties {
                 self.pulled += 1;
             }
         }
-    }
-}
-
-impl Tie for LinearSpring {
-    fn segments(&self) -> &[PointPair] {
-        &[]
-    }
-
-    fn rows(&self) -> usize {
-        1
-    }
-
-    fn tie(&self, _: &Instant<'_>, out: &mut Ties) {
-        out.add_sum(&self.terms, [-self.stiffness, 0.0]);
-    }
-}
-
-impl Tie for LinearDamper {
-    fn segments(&self) -> &[PointPair] {
-        &[]
-    }
-
-    fn rows(&self) -> usize {
-        1
-    }
-
-    fn tie(&self, at: &Instant<'_>, out: &mut Ties) {
-        let (_, slope) = self.resistance(at);
-        out.add_sum(&self.terms, [0.0, -slope]);
     }
 }

@@ -10,7 +10,8 @@ use plantd_math::scalar::Scalar;
 
 use crate::lagrangian::forces::GeneralizedForce;
 use crate::lagrangian::instant::Instant;
-use crate::model::mechanism::{LinearDamper, LinearLaw};
+use crate::lagrangian::ties::{Tie, Ties};
+use crate::model::mechanism::{LinearDamper, LinearLaw, PointPair};
 
 /// A bound of the second derivative of `tanh`.
 pub(super) const FRICTION_CURVE: f64 = 0.77;
@@ -28,7 +29,7 @@ impl LinearDamper {
     }
 
     /// `g` and `g'`
-    pub(crate) fn resistance<S: Scalar>(&self, at: &Instant<'_, S>) -> (S, S) {
+    fn resistance<S: Scalar>(&self, at: &Instant<'_, S>) -> (S, S) {
         let rate = self.rate(at);
         match self.law {
             LinearLaw::Damper { damping, input } => {
@@ -40,6 +41,21 @@ impl LinearDamper {
             }
             LinearLaw::Friction { force, velocity } => friction(force, velocity, rate),
         }
+    }
+}
+
+impl Tie for LinearDamper {
+    fn segments(&self) -> &[PointPair] {
+        &[]
+    }
+
+    fn rows(&self) -> usize {
+        1
+    }
+
+    fn tie(&self, at: &Instant<'_>, out: &mut Ties) {
+        let (_, slope) = self.resistance(at);
+        out.add_sum(&self.terms, [0.0, -slope]);
     }
 }
 

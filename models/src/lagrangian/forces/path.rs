@@ -14,7 +14,6 @@ use plantd_math::spatial::{Force, Vec3};
 use crate::lagrangian::fields::{Field, Take, at_point, change_at_point};
 use crate::lagrangian::forces::GeneralizedForce;
 use crate::lagrangian::forces::linear_damper::{FRICTION_CURVE, friction};
-use crate::lagrangian::forces::point::twist;
 use crate::lagrangian::instant::Instant;
 use crate::lagrangian::ties::{Tie, Ties, tied_rows};
 use crate::lagrangian::vectors::{Distance, moving_ends, steepness_of};
@@ -118,8 +117,8 @@ impl Field for PathForce {
         // `L' = J · unit` and `L̇' = J̇ · unit + J · turned`.
         let (mut unit, mut turned) = (Force::default(), Force::default());
         for end in ends() {
-            let velocity = twist(at, end.of).at(end.point);
-            let relative = velocity - twist(at, end.base).at(end.base_point);
+            let velocity = at.twist(end.of).at(end.point);
+            let relative = velocity - at.twist(end.base).at(end.base_point);
             let carried = Force { n: velocity.cross(end.along), f: Vec3::ZERO };
             unit = unit.plus(at_point(end.point, end.along));
             turned = turned.plus(at_point(end.point, end.turned(relative))).plus(carried);

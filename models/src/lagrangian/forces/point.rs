@@ -18,7 +18,7 @@ use crate::lagrangian::instant::Instant;
 use crate::lagrangian::ties::{Tie, Ties};
 use crate::lagrangian::vectors::{Distance, Separation};
 use crate::model::mechanism::{Carries, PathJoint, PointForce, PointLaw, PointPair, Span};
-use crate::model::tree::{Attachment, WORLD};
+use crate::model::tree::WORLD;
 
 /// Points whose squared distance (m²) or speed (m²/s²) is below this coincide or rest: there is no
 /// force, and no derivative. Above it three derivatives of a root stay within the range of numbers.
@@ -39,7 +39,7 @@ struct Acting<S: Scalar> {
 impl<S: Scalar> Acting<S> {
     fn new(force: &PointForce, at: &Instant<'_, S>) -> Self {
         let separation = force.ends.separation(at.tree, at.poses);
-        let twists = [&force.ends.a, &force.ends.b].map(|end| twist(at, end));
+        let twists = [&force.ends.a, &force.ends.b].map(|end| at.twist(end));
         let rate = twists[0].at(separation.a) - twists[1].at(separation.b);
         let of = match force.law {
             PointLaw::Damper(_) => separation.difference,
@@ -151,7 +151,7 @@ impl Field for PointForce {
             Carries::A => (acting.at.a, acting.force),
             _ => (acting.at.b, -acting.force),
         };
-        let velocity = twist(at, end).at(point);
+        let velocity = at.twist(end).at(point);
         take(at_point(point, force), &|axis, rate| {
             let moved = axis.at(point);
             let changed = acting.change(moved, rate.at(point) + axis.w.cross(velocity));
@@ -189,18 +189,13 @@ impl PointForce {
         } else {
             (&self.ends.b, separation.b)
         };
-        let carried = twist(at, end);
+        let carried = at.twist(end);
         let turned =
             at.momenta.axis_of(at.tree, joint.joint).cross(carried.minus(before(at, joint.joint)));
         let turned = turned.at(point);
         let turned = if joint.carries == Carries::A { turned } else { -turned };
         turned + carried.w.cross(gradient)
     }
-}
-
-/// Twist of what a point is fixed to.
-pub(crate) fn twist<S: Scalar>(at: &Instant<'_, S>, end: &Attachment) -> Motion<S> {
-    if end.joint == WORLD { Motion::default() } else { at.momenta.twist_of(at.tree, end.joint) }
 }
 
 /// Twist of what a joint hangs from; for an axis of a ball joint, what the whole joint hangs from.

@@ -6,14 +6,30 @@
 
 use plantd_math::scalar::Scalar;
 
+use crate::lagrangian::instant::Instant;
 use crate::lagrangian::kinematics::Place;
 use crate::lagrangian::potentials::Potential;
-use crate::model::mechanism::LinearSpring;
+use crate::lagrangian::ties::{Tie, Ties};
+use crate::model::mechanism::{LinearSpring, PointPair};
 
 impl LinearSpring {
     /// `s`.
     fn stretch<S: Scalar>(&self, q: &[S]) -> S {
         self.terms.iter().fold(S::constant(-self.rest), |sum, &(i, c)| sum + q[i] * c)
+    }
+}
+
+impl Tie for LinearSpring {
+    fn segments(&self) -> &[PointPair] {
+        &[]
+    }
+
+    fn rows(&self) -> usize {
+        1
+    }
+
+    fn tie(&self, _: &Instant<'_>, out: &mut Ties) {
+        out.add_sum(&self.terms, [-self.stiffness, 0.0]);
     }
 }
 
