@@ -133,7 +133,8 @@ impl KktSystem {
         let nd = model.dimensions.dynamic;
         let entries = model.elimination.entries();
         let is_closed = model.dimensions.constraints > 0 || model.has_ties;
-        let mut in_space = (model.is_generated_in_space())
+        // Limbs that are held have a linearization of their own.
+        let mut in_space = (model.is_generated_in_space() && model.held.is_none())
             .then(|| Derivatives::new(model))
             .filter(|own| own.is_faster(entries, is_closed));
         if let Some(in_space) = &mut in_space {
