@@ -8,7 +8,7 @@ use plantd_math::spatial::Vec3;
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::vectors::Separation;
 use crate::model::mechanism::{ConstraintKind, Model, PointPair};
-use crate::model::tree::{Tree, WORLD};
+use crate::model::tree::Tree;
 
 /// What a joint gives.
 #[derive(Clone, Copy, Debug, Default)]
@@ -83,11 +83,9 @@ impl Bends {
     ) {
         let row = self.begin_row(weight);
         for (end, point, sign) in [(&points.a, at.a, 1.0), (&points.b, at.b, -1.0)] {
-            let mut joint = end.joint;
-            while joint != WORLD {
+            for joint in tree.ascend(end.joint) {
                 let by = poses.point_gradient(tree, joint, point);
                 row[tree.joints[joint].coordinate] += sign * axis.dot(by);
-                joint = tree.joints[joint].parent;
             }
         }
     }
@@ -97,6 +95,34 @@ impl Bends {
         self.begin_row(value)[coordinate] = 1.0;
     }
 
+    /// Takes the product with `x` off `out`. Both may be of dynamic coordinates alone.
+    pub(crate) fn subtract_product(&self, sums: &mut Sums<1>, x: &[f64], out: &mut [f64]) {
+        self.subtract_transposed(sums, x, out);
+        // Of the axes of one ball joint `H` is not symmetric: they turn with it.
+        for row in &self.joints {
+            let axes = self.joints[row.first..].iter().take_while(|axis| axis.first == row.first);
+            if let Some(out) = out.get_mut(row.coordinate) {
+                for (axis, x) in axes.zip(x.iter().skip(self.joints[row.first].coordinate)) {
+                    *out -= (row.torque.dot(axis.axis) - row.axis.dot(axis.torque)) * x;
+                }
+            }
+        }
+    }
+
+    /// The same with the transposed matrix.
+    pub(crate) fn subtract_transposed(&self, sums: &mut Sums<1>, x: &[f64], out: &mut [f64]) {
+        for (row, weight) in self.products() {
+            let along: f64 = row.iter().zip(x).map(|(entry, x)| entry * x).sum();
+            out.iter_mut().zip(row).for_each(|(out, entry)| *out -= weight * along * entry);
+        }
+        sums.add_up(&self.joints, |i| [x.get(i).copied().unwrap_or_default()]);
+        for (i, [product]) in sums.products(&self.joints) {
+            if let Some(out) = out.get_mut(i) {
+                *out -= product;
+            }
+        }
+    }
+
     fn begin_row(&mut self, weight: f64) -> &mut [f64] {
         let row = &mut self.rows[self.filled * self.n..][..self.n];
         row.fill(0.0);
@@ -104,4 +130,69 @@ impl Bends {
         self.filled += 1;
         row
     }
+}
+
+/// Sums over what is above joints, and below them, of vectors side by side.
+#[derive(Clone, Debug)]
+pub(crate) struct Sums<const L: usize> {
+    above: Vec<Sides<L>>,
+    below: Vec<Sides<L>>,
+}
+
+/// A vector of each side.
+type Sides<const L: usize> = [[f64; L]; 3];
+
+impl<const L: usize> Sums<L> {
+    /// Room for so many joints.
+    pub(crate) fn new(joints: usize) -> Self {
+        let zeros = || vec![[[0.0; L]; 3]; joints];
+        Self { above: zeros(), below: zeros() }
+    }
+
+    /// Adds up axes and torques, times entries of vectors by coordinate.
+    #[inline(always)]
+    pub(crate) fn add_up(&mut self, joints: &[Bend], x: impl Fn(usize) -> [f64; L]) {
+        let Self { above, below } = self;
+        for (j, bend) in joints.iter().enumerate() {
+            let x = x(bend.coordinate);
+            above[j] = above.get(bend.parent).copied().unwrap_or([[0.0; L]; 3]);
+            add_scaled(&mut above[j], bend.axis, &x);
+            below[j] = [[0.0; L]; 3];
+            add_scaled(&mut below[j], bend.torque, &x);
+        }
+        for (j, bend) in joints.iter().enumerate().rev() {
+            let own = below[j];
+            if let Some(parent) = below.get_mut(bend.parent) {
+                for (parent, own) in parent.iter_mut().zip(&own) {
+                    parent.iter_mut().zip(own).for_each(|(parent, own)| *parent += own);
+                }
+            }
+        }
+    }
+
+    /// Entries of `xᵀ H` by coordinate, without its products, of the vectors that were added up.
+    #[inline(always)]
+    pub(crate) fn products(&self, joints: &[Bend]) -> impl Iterator<Item = (usize, [f64; L])> {
+        let Self { above, below } = self;
+        joints.iter().map(move |bend| {
+            let mut product = dot(&below[bend.first], bend.axis);
+            if let Some(above) = above.get(joints[bend.first].parent) {
+                let turned = dot(above, bend.torque);
+                product.iter_mut().zip(turned).for_each(|(product, turned)| *product += turned);
+            }
+            (bend.coordinate, product)
+        })
+    }
+}
+
+#[inline(always)]
+fn add_scaled<const L: usize>(to: &mut Sides<L>, Vec3(vector): Vec3, x: &[f64; L]) {
+    for (to, entry) in to.iter_mut().zip(vector) {
+        to.iter_mut().zip(x).for_each(|(to, x)| *to += entry * x);
+    }
+}
+
+#[inline(always)]
+fn dot<const L: usize>([x, y, z]: &Sides<L>, Vec3([a, b, c]): Vec3) -> [f64; L] {
+    std::array::from_fn(|i| a * x[i] + b * y[i] + c * z[i])
 }

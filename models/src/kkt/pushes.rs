@@ -5,9 +5,8 @@
 
 use plantd_math::rows::{AlignedRows, LANES, Term, add_rows, non_zero, padded};
 use plantd_math::simd::wide;
-use plantd_math::spatial::Vec3;
 
-use crate::constraints::bends::Bends;
+use crate::constraints::bends::{Bends, Sums};
 use crate::constraints::closure::Closure;
 use crate::model::mechanism::Model;
 
@@ -134,13 +133,9 @@ pub(crate) struct Bending {
     pushes: Pushes,
     responses: Vec<f64>,
     weighted: AlignedRows,
-    /// Sums over what is above joints, and below them, of rows side by side.
-    above: Vec<Side3>,
-    below: Vec<Side3>,
+    /// Of rows side by side.
+    sums: Sums<LANES>,
 }
-
-/// A vector of each of some rows.
-type Side3 = [[f64; LANES]; 3];
 
 impl Bending {
     /// Room for a model, with rows of its linearization that are so long; `None` where `H` has no such form.
@@ -155,8 +150,7 @@ impl Bending {
             pushes: Pushes::new(model, stride, count, false),
             responses: vec![0.0; nd * padded(count)],
             weighted: AlignedRows::zeros(count * stride),
-            above: vec![[[0.0; LANES]; 3]; joints],
-            below: vec![[[0.0; LANES]; 3]; joints],
+            sums: Sums::new(joints),
             bends,
         })
     }
@@ -177,53 +171,22 @@ impl Bending {
             self.pushes.add_to(rows, &self.responses, &self.weighted, terms);
         }
         wide!({
-            let Self { bends, n, nd, stride, above, below, .. } = self;
-            let joints = &bends.joints[..];
+            let Self { bends, n, nd, stride, sums, .. } = self;
             for rows in rows.chunks_mut(LANES * *stride) {
                 let count = rows.len() / *stride;
-                for (j, bend) in joints.iter().enumerate() {
+                sums.add_up(&bends.joints, |i| {
                     let mut x = [0.0; LANES];
-                    if bend.coordinate < *nd {
-                        let numbers = rows[*n + bend.coordinate..].iter().step_by(*stride);
+                    if i < *nd {
+                        let numbers = rows[*n + i..].iter().step_by(*stride);
                         x.iter_mut().zip(numbers).for_each(|(x, number)| *x = *number);
                     }
-                    let parent = above.get(bend.parent).copied().unwrap_or_default();
-                    above[j] = parent;
-                    add_scaled(&mut above[j], bend.axis, &x);
-                    below[j] = [[0.0; LANES]; 3];
-                    add_scaled(&mut below[j], bend.torque, &x);
-                }
-                for (j, bend) in joints.iter().enumerate().rev() {
-                    let own = below[j];
-                    if let Some(parent) = below.get_mut(bend.parent) {
-                        for (parent, own) in parent.iter_mut().zip(&own) {
-                            parent.iter_mut().zip(own).for_each(|(parent, own)| *parent += own);
-                        }
-                    }
-                }
-                for bend in joints {
-                    let outside = joints[bend.first].parent;
-                    let mut taken = dot(&below[bend.first], bend.axis);
-                    if let Some(above) = above.get(outside) {
-                        let turned = dot(above, bend.torque);
-                        taken.iter_mut().zip(turned).for_each(|(taken, turned)| *taken += turned);
-                    }
-                    let entries = rows[bend.coordinate..].iter_mut().step_by(*stride);
+                    x
+                });
+                for (i, taken) in sums.products(&bends.joints) {
+                    let entries = rows[i..].iter_mut().step_by(*stride);
                     entries.zip(taken).take(count).for_each(|(entry, taken)| *entry -= taken);
                 }
             }
         });
     }
-}
-
-#[inline(always)]
-fn add_scaled(to: &mut Side3, Vec3(vector): Vec3, x: &[f64; LANES]) {
-    for (to, entry) in to.iter_mut().zip(vector) {
-        to.iter_mut().zip(x).for_each(|(to, x)| *to += entry * x);
-    }
-}
-
-#[inline(always)]
-fn dot([x, y, z]: &Side3, Vec3([a, b, c]): Vec3) -> [f64; LANES] {
-    std::array::from_fn(|i| a * x[i] + b * y[i] + c * z[i])
 }

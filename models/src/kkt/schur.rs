@@ -5,6 +5,7 @@ use plantd_math::rows::padded;
 use plantd_math::tree_lu::TreeLu;
 
 use crate::constraints::closure::Closure;
+use crate::kkt::closing::Closing;
 use crate::model::mechanism::Model;
 
 /// `S`, factored, with what it is made of.
@@ -22,6 +23,12 @@ impl SchurComplement {
         let d = model.dimensions;
         let responses = vec![0.0; d.dynamic * padded(d.constraints)];
         Self { responses, lu: room_for_schur(model, stride), row: vec![0.0; d.dynamic] }
+    }
+
+    /// Room for products.
+    pub(crate) fn new_closing(model: &Model) -> Closing {
+        let d = model.dimensions;
+        Closing::new(d.dynamic, 2 * d.coordinates(), room_for_schur(model, 1), d.constraints)
     }
 
     /// Finds `K⁻¹ A0ᵀ` with what solves, and the Jacobian at the start.

@@ -12,9 +12,10 @@
 //! ```
 
 use plantd_math::pivoted_lu::PivotedLu;
-use plantd_math::rows::{AlignedRows, LANES, Term, add_rows, non_zero, padded};
+use plantd_math::rows::{AlignedRows, Term, add_rows, dot, non_zero, padded};
 use plantd_math::spatial::{Mat3, Vec3};
 
+use crate::kkt::closing::Closing;
 use crate::kkt::pushes::Pushes;
 use crate::kkt::space::columns::Rows;
 use crate::lagrangian::ties::{Entry, Ties};
@@ -184,6 +185,36 @@ impl Tied {
         true
     }
 
+    /// Room for products.
+    pub(crate) fn new_closing(model: &Model) -> Closing {
+        let (d, count) = (model.dimensions, model.tied_rows());
+        let lu = PivotedLu::new(&vec![1.0; count], 1).with_independent(count);
+        Closing::new(d.dynamic, 2 * d.coordinates(), lu, count)
+    }
+
+    /// Closes products of the tree, with what finds the increment and the momentum at the end that belong to a push, in
+    /// its place. False where they are not sound.
+    pub(crate) fn close_products(
+        &mut self,
+        step: (&[Turning], f64),
+        closing: &mut Closing,
+        respond: impl FnMut(&mut [f64], &mut [f64]),
+    ) -> bool {
+        let is_sound = self.factor(closing.take_responses(respond));
+        closing.take_factors_of(&self.lu);
+        let rows = self.ties.rows().zip(self.pushes.chunks_exact(self.nd));
+        let rows = rows.zip(self.changes.chunks_exact(self.nd)).zip(closing.equations());
+        for (((row, pushes), changes), equation) in rows {
+            equation.by_increment.copy_from_slice(changes);
+            equation.by_parameters.fill(0.0);
+            by_parameters(row, self.nd, step, equation.by_parameters);
+            for ((momentum, entry), push) in equation.momentum.iter_mut().zip(row).zip(pushes) {
+                *momentum += push - 2.0 * entry.length;
+            }
+        }
+        is_sound
+    }
+
     /// Adds, `weight` times, how the generalized forces change with changes of the coordinates and velocities.
     pub(crate) fn add_change(
         &self,
@@ -244,18 +275,4 @@ fn of_ball(row: &[Entry], first: usize) -> [Vec3; 3] {
 
 fn put(row: &mut [f64], first: usize, Vec3(numbers): Vec3) {
     row[first..first + 3].copy_from_slice(&numbers);
-}
-
-/// `a · b`, in sums side by side.
-fn dot(a: &[f64], b: &[f64]) -> f64 {
-    let (a, rest_a) = a.as_chunks::<LANES>();
-    let (b, rest_b) = b.as_chunks::<LANES>();
-    let mut sums = [0.0; LANES];
-    for (a, b) in a.iter().zip(b) {
-        for (sum, (a, b)) in sums.iter_mut().zip(a.iter().zip(b)) {
-            *sum += a * b;
-        }
-    }
-    let rest: f64 = rest_a.iter().zip(rest_b).map(|(a, b)| a * b).sum();
-    sums.iter().sum::<f64>() + rest
 }

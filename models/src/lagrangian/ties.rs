@@ -176,14 +176,13 @@ impl Ties {
         self.moved.fill(Moved::default());
         let separation = ends.separation(at.tree, at.poses);
         for (end, point, sign) in [(&ends.a, separation.a, 1.0), (&ends.b, separation.b, -1.0)] {
-            let (mut joint, velocity) = (end.joint, at.twist(end).at(point));
-            while joint != WORLD {
+            let velocity = at.twist(end).at(point);
+            for joint in at.tree.ascend(end.joint) {
                 let axis = at.momenta.axis_of(at.tree, joint);
                 let rate = at.momenta.axis_rate_of(at.tree, joint);
                 let own = &mut self.moved[at.tree.joints[joint].coordinate];
                 own.by += axis.at(point) * sign;
                 own.faster += (rate.at(point) + axis.w.cross(velocity)) * sign;
-                joint = at.tree.joints[joint].parent;
             }
         }
     }

@@ -1,26 +1,35 @@
 //! The derivative of a step as a map: products with `A`, `B` and their transposes, without the matrices.
 
+use plantd_math::rows::dot;
 use plantd_math::sparse_map::Map;
 use plantd_math::spatial::three;
 
+use crate::constraints::bends::{Bends, Sums};
 use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
 use crate::integrator::workspace::{StepContext, Workspace};
+use crate::kkt::closing::Closing;
+use crate::kkt::schur::SchurComplement;
 use crate::kkt::space::derivatives::Derivatives;
+use crate::kkt::system::KktSystem;
+use crate::kkt::tied::Tied;
 use crate::lagrangian::fields::Fields;
 use crate::linearization::ends::Ends;
 use crate::linearization::linearize::Linearization;
-use crate::linearization::step::takes_split;
+use crate::linearization::step::{fill_by_parameters, takes_split};
 use crate::model::mechanism::Model;
 
 /// The derivative of a control period as a map, `x[k+1]' = A x[k]' + B u[k]'`, and its transpose: for gradients along
 /// motions, and for whoever solves by iteration.
 ///
 /// Of one step of the midpoint rule of a tree it takes O(n) to find and to apply, and O(n) of memory, where `A` and
-/// `B` take O(n²): without constraints, and without springs, dampers and forces between two bodies of which none is
-/// above the other. Springs, drag and forces at points and frames that act from the world, or from bodies above, are
-/// taken with equal halves ([`ForceSplit::Symmetric`](crate::ForceSplit)) alone. All else is by the matrices, to the
-/// same numbers. The memory is made by the first [`Plant::differentiate`](crate::Plant::differentiate).
+/// `B` take O(n²). Each of `m` equations of constraints, and of rows of what acts between two bodies of which none is
+/// above the other, along paths over several bodies and on sums of coordinates, takes another O(n) to apply and
+/// O(n + m²) to find. Springs, drag and forces at points and frames are taken with equal halves
+/// ([`ForceSplit::Symmetric`](crate::ForceSplit)) alone; points on planes and orientations that are held, whose
+/// second derivatives are filled, in O(n²). All else, lengths that are prescribed and armatures of sums among it, is by
+/// the matrices, to the same numbers. The memory is made by the first
+/// [`Plant::differentiate`](crate::Plant::differentiate).
 ///
 /// ```
 /// use std::sync::Arc;
@@ -73,9 +82,30 @@ enum Means {
 /// By generators.
 #[derive(Debug)]
 struct Generated {
-    derivatives: Derivatives,
-    /// What acts on bodies, where steps have not that.
+    tree: ClosedTree,
+    /// How constraints turn with the start configuration.
+    bent: Bent,
+    /// What acts on and between bodies, where steps have not that.
     fields: Option<Box<Fields>>,
+    tied: Option<Box<Tied>>,
+}
+
+/// A tree, and what closes it one after the other: its ties, if it has some, and its constraints.
+#[derive(Debug)]
+struct ClosedTree {
+    derivatives: Derivatives,
+    closings: Vec<Closing>,
+    /// How many of them do already.
+    closed: usize,
+}
+
+/// `H = Σ λ D²h`, by the coordinates at the start.
+#[derive(Debug)]
+enum Bent {
+    Nothing,
+    Products { bends: Bends, sums: Sums<1> },
+    /// Row-major.
+    Filled(Vec<f64>),
 }
 
 /// By matrices.
@@ -88,8 +118,88 @@ struct Formed {
 
 /// Whether the derivative of one step of the midpoint rule is by generators.
 pub(crate) fn is_generated(model: &Model, settings: &Settings) -> bool {
-    let is_closed = model.dimensions.constraints > 0 || model.has_ties;
-    !is_closed && model.is_generated() && takes_split(model, settings)
+    model.is_generated() && takes_split(model, settings)
+}
+
+impl ClosedTree {
+    /// Room for those of a model.
+    fn new(model: &Model) -> Self {
+        let ties = model.has_ties.then(|| Tied::new_closing(model));
+        let has_constraints = model.dimensions.constraints > 0;
+        let constraints = has_constraints.then(|| SchurComplement::new_closing(model));
+        Self {
+            derivatives: Derivatives::new(model),
+            closings: ties.into_iter().chain(constraints).collect(),
+            closed: 0,
+        }
+    }
+
+    /// What closes it next, and what finds the increment and the momentum at the end that belong to a push, in its
+    /// place, until then. `by` is memory.
+    fn close_next<'a>(
+        &'a mut self,
+        by: &'a mut [f64],
+    ) -> (&'a mut Closing, impl FnMut(&mut [f64], &mut [f64])) {
+        let Self { derivatives, closings, closed } = self;
+        let (before, after) = closings.split_at_mut(*closed);
+        *closed += 1;
+        let respond = move |row: &mut [f64], momentum: &mut [f64]| {
+            let pushed = by.len() / 2;
+            by.fill(0.0);
+            by[pushed..].iter_mut().zip(&*row).for_each(|(by, entry)| *by = -entry);
+            derivatives.push_forward(by, row, momentum);
+            before.iter_mut().for_each(|closing| closing.close(by, row, momentum));
+        };
+        (&mut after[0], respond)
+    }
+
+    fn push_forward(&mut self, by: &[f64], x: &mut [f64], momentum: &mut [f64]) {
+        self.derivatives.push_forward(by, x, momentum);
+        self.closings.iter_mut().for_each(|closing| closing.close(by, x, momentum));
+    }
+
+    fn pull_back(&mut self, x: &mut [f64], momentum: &[f64], by: &mut [f64]) {
+        self.closings.iter_mut().rev().for_each(|closing| closing.weigh(x, momentum));
+        self.derivatives.pull_back(x, momentum, by);
+        self.closings.iter().for_each(|closing| closing.add_weighed(by));
+    }
+}
+
+impl Bent {
+    fn new(model: &Model) -> Self {
+        let n = model.dimensions.coordinates();
+        match Bends::new(model) {
+            _ if model.dimensions.constraints == 0 => Self::Nothing,
+            Some(bends) => Self::Products { sums: Sums::new(model.closure.joints.len()), bends },
+            None => Self::Filled(vec![0.0; n * n]),
+        }
+    }
+
+    /// Takes what it gives to the momentum off `p`, by the start configuration.
+    fn push_forward(&mut self, q: &[f64], p: &mut [f64]) {
+        match self {
+            Self::Nothing => {}
+            Self::Products { bends, sums } => bends.subtract_product(sums, q, p),
+            Self::Filled(rows) => {
+                for (p, row) in p.iter_mut().zip(rows.chunks_exact(q.len())) {
+                    *p -= dot(row, q);
+                }
+            }
+        }
+    }
+
+    /// The transpose: takes off `q`, by what the momentum weighs.
+    fn pull_back(&mut self, p: &[f64], q: &mut [f64]) {
+        match self {
+            Self::Nothing => {}
+            Self::Products { bends, sums } => bends.subtract_transposed(sums, p, q),
+            Self::Filled(rows) => {
+                for (p, row) in p.iter().zip(rows.chunks_exact(q.len())) {
+                    q.iter_mut().zip(row).for_each(|(q, entry)| *q -= p * entry);
+                }
+            }
+        }
+    }
 }
 
 impl StepDerivative {
@@ -108,6 +218,11 @@ impl StepDerivative {
             x: vec![0.0; d.dynamic],
             momentum: vec![0.0; d.dynamic],
         }
+    }
+
+    /// Whether there is one.
+    pub(crate) fn is_there(&self) -> bool {
+        !matches!(self.means, Means::Nothing)
     }
 
     /// Forgets the last step. Panics if it was made for a model of other dimensions.
@@ -149,13 +264,13 @@ impl StepDerivative {
         let (nd, nk, ni) = (*nd, *nk, *ni);
         let n = nd + nk;
         assert_eq!((x.len(), u.len(), next.len()), (2 * n, ni + nk, 2 * n), "sizes of x, u, next");
-        let derivatives = match (means, generated, formed) {
+        let Generated { tree, bent, .. } = match (means, generated, formed) {
             (Means::Formed, _, Some(formed)) => {
                 let Formed { map, packed, .. } = &mut **formed;
                 map.apply(x, u, packed, next);
                 return;
             }
-            (Means::Generated, Some(generated), _) => &mut generated.derivatives,
+            (Means::Generated, Some(generated), _) => &mut **generated,
             _ => {
                 next.fill(0.0);
                 return;
@@ -170,7 +285,9 @@ impl StepDerivative {
         for impulse in &ends.inputs {
             by[n + impulse.coordinate] += impulse.residual * u[impulse.input];
         }
-        derivatives.push_forward(by, increment, momentum);
+        let (start, pushes) = by.split_at_mut(n);
+        bent.push_forward(start, &mut pushes[..nd]);
+        tree.push_forward(by, increment, momentum);
         let rate = 1.0 / ends.time_step_s;
         let (q, p) = next.split_at_mut(n);
         q[..nd].copy_from_slice(increment);
@@ -212,13 +329,13 @@ impl StepDerivative {
         );
         by_x.fill(0.0);
         by_u.fill(0.0);
-        let derivatives = match (means, generated, formed) {
+        let Generated { tree, bent, .. } = match (means, generated, formed) {
             (Means::Formed, _, Some(formed)) => {
                 let Formed { map, packed, .. } = &mut **formed;
                 map.add_pulled_back(z, packed, by_x, by_u);
                 return;
             }
-            (Means::Generated, Some(generated), _) => &mut generated.derivatives,
+            (Means::Generated, Some(generated), _) => &mut **generated,
             _ => return,
         };
         let rate = 1.0 / ends.time_step_s;
@@ -229,7 +346,9 @@ impl StepDerivative {
             let i = t.coordinate;
             x[i..i + 3].copy_from_slice(&t.to_end.apply_transposed(three(q, i)).0);
         }
-        derivatives.pull_back(x, momentum, by);
+        tree.pull_back(x, momentum, by);
+        let (start, pushes) = by.split_at_mut(n);
+        bent.pull_back(&pushes[..nd], start);
         by_x[..n + nd].copy_from_slice(&by[..n + nd]);
         by_u[ni..].copy_from_slice(&by[n + nd..]);
         by_x[..nd].iter_mut().zip(q).for_each(|(by, q)| *by += q);
@@ -262,19 +381,24 @@ impl StepDerivative {
 }
 
 impl Workspace {
-    /// Differentiates by generators at the solution in the workspace, where [`is_generated`] is true.
+    /// Differentiates by generators at the solution in the workspace, where [`is_generated`] is true; nothing, where
+    /// they are not sound.
     pub(crate) fn differentiate(
         &mut self,
         at: StepContext<'_>,
         out: &mut StepDerivative,
     ) -> Result<(), StepError> {
         let StepContext { model, settings, .. } = at;
-        let StepDerivative { ends, generated, x, momentum, .. } = out;
-        let has_fields = self.kkt.fields.is_some() || !model.has_fields();
-        let Generated { derivatives, fields } = &mut **generated.get_or_insert_with(|| {
+        let StepDerivative { ends, generated, by, x, momentum, .. } = out;
+        let KktSystem { fields, tied, .. } = &self.kkt;
+        let has_fields = fields.is_some() || !model.has_fields();
+        let has_ties = tied.is_some() || !model.has_ties;
+        let generated = &mut **generated.get_or_insert_with(|| {
             Box::new(Generated {
-                derivatives: Derivatives::new(model),
+                tree: ClosedTree::new(model),
+                bent: Bent::new(model),
                 fields: (!has_fields).then(|| Box::new(Fields::new(model))),
+                tied: (!has_ties).then(|| Box::new(Tied::new(model, 1))),
             })
         });
         ends.time_step_s = settings.time_step_s;
@@ -288,16 +412,70 @@ impl Workspace {
         } else if !is_differentiated {
             self.mid.mechanics.differentiate(model);
         }
-        if !has_fields {
-            std::mem::swap(&mut self.kkt.fields, fields);
-        }
-        let result = self.differentiate_in_space(at, ends, derivatives);
-        if !has_fields {
-            std::mem::swap(&mut self.kkt.fields, fields);
-        }
-        result?;
-        out.means = Means::Generated;
+        let swap = |kkt: &mut KktSystem, generated: &mut Generated| {
+            if !has_fields {
+                std::mem::swap(&mut kkt.fields, &mut generated.fields);
+            }
+            if !has_ties {
+                std::mem::swap(&mut kkt.tied, &mut generated.tied);
+            }
+        };
+        swap(&mut self.kkt, generated);
+        let result = self.differentiate_generated(at, ends, generated, by);
+        swap(&mut self.kkt, generated);
+        out.means = if result? { Means::Generated } else { Means::Nothing };
         Ok(())
+    }
+
+    /// Finds the derivatives of the tree, and closes them; false where ties are not sound. `by` is memory.
+    fn differentiate_generated(
+        &mut self,
+        at: StepContext<'_>,
+        ends: &mut Ends,
+        generated: &mut Generated,
+        by: &mut [f64],
+    ) -> Result<bool, StepError> {
+        let StepContext { model, settings, state, .. } = at;
+        let Settings { time_step_s, singular_below, .. } = *settings;
+        let Generated { tree, bent, .. } = generated;
+        tree.closed = 0;
+        let result = self.differentiate_in_space(at, ends, &mut tree.derivatives);
+        if let Some(tied) = &mut self.kkt.tied {
+            // A pivot that is too small may be one by the generators alone.
+            if result.is_err() {
+                return Ok(false);
+            }
+            let (closing, respond) = tree.close_next(by);
+            if !tied.close_products((&ends.turnings, time_step_s), closing, respond) {
+                return Ok(false);
+            }
+        } else {
+            result?;
+        }
+        if model.dimensions.constraints == 0 {
+            return Ok(true);
+        }
+        self.prepare_start(model, state);
+        self.finish_end(model, state);
+        let Self { constraints, kkt, step, .. } = self;
+        let (start, multipliers) = (&mut constraints.start, &step.multipliers);
+        match bent {
+            Bent::Nothing => {}
+            Bent::Products { bends, .. } => start.bend(model, &state.q, multipliers, bends),
+            Bent::Filled(rows) => start.hessian(model, &state.q, multipliers, rows),
+        }
+        let (closing, respond) = tree.close_next(by);
+        kkt.schur.respond(model, start, closing.take_responses(respond));
+        let is_regular = kkt.close_schur(model, &constraints.end, time_step_s, singular_below);
+        closing.take_factors_of(&kkt.schur.lu);
+        let (n, nd) = (model.dimensions.coordinates(), model.dimensions.dynamic);
+        let rows = constraints.end.jacobian.chunks_exact(n).zip(closing.equations());
+        for (jacobian, equation) in rows {
+            equation.by_increment.copy_from_slice(&jacobian[..nd]);
+            fill_by_parameters(jacobian, nd, ends, equation.by_parameters);
+        }
+        self.check_schur(model, is_regular)?;
+        Ok(true)
     }
 }
 
@@ -310,7 +488,8 @@ mod tests {
     use crate::plant::facade::Plant;
     use plantd_scene::builtin;
 
-    /// Trees in planes and in space go without matrices; what has constraints, several steps or stages does not.
+    /// Trees in planes and in space go without matrices, and so do loops; several steps or stages do not, nor lengths that
+    /// are prescribed.
     #[test]
     fn trees_need_no_matrices() {
         let builtin = |name: &str| Model::compile(&builtin::scene(name).unwrap()).unwrap();
@@ -321,7 +500,7 @@ mod tests {
             (oblique(5, ""), 2, true),
             (builtin("balls-3"), 2, true),
             (builtin("chain-8"), 4, false),
-            (builtin("four-bar"), 2, false),
+            (builtin("four-bar"), 2, true),
             (builtin("marionette"), 2, false),
         ] {
             let model = Arc::new(model);

@@ -508,19 +508,10 @@ impl Workspace {
 
     /// Writes `r2'` into `out.multipliers`.
     fn fill_closing(&self, at: StepContext<'_>, out: &mut Linearization) {
-        let d = at.model.dimensions;
-        let (n, nd, next) = (d.coordinates(), d.dynamic, out.next_columns());
+        let (n, nd) = (at.model.dimensions.coordinates(), out.nd);
         let rows = out.multipliers.chunks_exact_mut(out.stride.max(1));
         for (target, jacobian) in rows.zip(self.constraints.end.jacobian.chunks_exact(n.max(1))) {
-            target.fill(0.0);
-            target[..nd].copy_from_slice(&jacobian[..nd]);
-            for turning in out.ends.turnings.iter().filter(|turning| turning.coordinate < nd) {
-                // From the columns of `ξ`, by dexp₋ξ, to those of the start: exp(−ξ) = dexp₋ξ N⁺.
-                let i = turning.coordinate;
-                let carried = turning.momentum.apply(three(target, i));
-                target[i..i + 3].copy_from_slice(&carried.0);
-            }
-            target[next..].iter_mut().zip(&jacobian[nd..]).for_each(|(t, entry)| *t = *entry);
+            fill_by_parameters(jacobian, nd, &out.ends, target);
         }
     }
 
@@ -562,6 +553,20 @@ pub(crate) fn takes_split(model: &Model, settings: &Settings) -> bool {
                 .forces
                 .as_ref()
                 .is_none_or(|forces| !forces.cross_balls() && !model.has_fields())
+}
+
+/// Writes how an equation at the end changes with the columns `(q, p, k)`, at a fixed increment.
+pub(crate) fn fill_by_parameters(jacobian: &[f64], nd: usize, ends: &Ends, row: &mut [f64]) {
+    row.fill(0.0);
+    row[..nd].copy_from_slice(&jacobian[..nd]);
+    for turning in ends.turnings.iter().filter(|turning| turning.coordinate < nd) {
+        // From the columns of `ξ`, by dexp₋ξ, to those of the start: exp(−ξ) = dexp₋ξ N⁺.
+        let i = turning.coordinate;
+        let carried = turning.momentum.apply(three(row, i));
+        row[i..i + 3].copy_from_slice(&carried.0);
+    }
+    let next = row[jacobian.len() + nd..].iter_mut();
+    next.zip(&jacobian[nd..]).for_each(|(to, entry)| *to = *entry);
 }
 
 /// Impulses of inputs of coordinates.

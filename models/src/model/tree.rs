@@ -213,14 +213,18 @@ impl Tree {
     }
 
     /// Proper ancestors of a joint and the joint itself, root first.
-    pub(crate) fn path(&self, mut joint: usize) -> Vec<usize> {
-        let mut path = Vec::new();
-        while joint != WORLD {
-            path.push(joint);
-            joint = self.joints[joint].parent;
-        }
+    pub(crate) fn path(&self, joint: usize) -> Vec<usize> {
+        let mut path: Vec<usize> = self.ascend(joint).collect();
         path.reverse();
         path
+    }
+
+    /// A joint and its proper ancestors, root last; none of the world.
+    #[inline]
+    pub(crate) fn ascend(&self, joint: usize) -> impl Iterator<Item = usize> {
+        let is_joint = |joint: &usize| *joint != WORLD;
+        let parent = move |joint: &usize| Some(self.joints[*joint].parent).filter(is_joint);
+        std::iter::successors(Some(joint).filter(is_joint), parent)
     }
 
     /// Whether two joints are axes of one ball joint.

@@ -26,8 +26,11 @@ impl Plant {
             return self.differentiate_by_matrices(u, out);
         }
         let Self { model, settings, state, workspace, period } = self;
-        let u = period.input.of_step(model, state, settings.time_step_s, u, [0.0, 1.0])?;
-        workspace.differentiate(StepContext { model, settings, state, u }, out)?;
+        let of_step = period.input.of_step(model, state, settings.time_step_s, u, [0.0, 1.0])?;
+        workspace.differentiate(StepContext { model, settings, state, u: of_step }, out)?;
+        if !out.is_there() {
+            return self.differentiate_by_matrices(u, out);
+        }
         workspace.kkt.estimates.write(&mut workspace.step.report);
         Ok(workspace.step.report)
     }

@@ -8,6 +8,7 @@
 //!
 //! which is Newton's method as far as the past rounds know the Jacobian.
 
+use plantd_math::rows::dot;
 use plantd_math::simd::wide;
 
 /// Rounds that count.
@@ -30,19 +31,6 @@ pub(crate) struct Secants {
     change: Vec<f64>,
     /// `ΔFᵀ ΔF`.
     products: [[f64; DEPTH]; DEPTH],
-}
-
-#[inline(always)]
-fn dot(a: &[f64], b: &[f64]) -> f64 {
-    let (a, b) = (a.as_chunks::<8>(), b.as_chunks::<8>());
-    let mut sums = [0.0; 8];
-    for (a, b) in a.0.iter().zip(b.0) {
-        for (sum, (a, b)) in sums.iter_mut().zip(a.iter().zip(b)) {
-            *sum += a * b;
-        }
-    }
-    let rest: f64 = a.1.iter().zip(b.1).map(|(a, b)| a * b).sum();
-    sums.iter().sum::<f64>() + rest
 }
 
 impl Secants {

@@ -18,6 +18,7 @@ use crate::kkt::tied::Tied;
 use crate::lagrangian::fields::Fields;
 use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::samples::{prescribe, rubbing};
+use crate::linearization::derivative::StepDerivative;
 use crate::linearization::linearize::Linearization;
 use crate::model::mechanism::Acting;
 use crate::model::mechanism::{Model, Solver};
@@ -386,7 +387,29 @@ fn move_alike(model: &Arc<Model>, steps: u32) -> Plant {
         let [a, b] = linear.each_ref().map(of);
         assert!((&a - &b).amax() <= 1e-9 * b.amax(), "{:e} {:e}", (&a - &b).amax(), b.amax());
     }
+    assert_products(&mut fast, &mut linear[0], &u);
     fast
+}
+
+/// Products with a step's derivative are those with its matrices.
+fn assert_products(plant: &mut Plant, out: &mut Linearization, u: &[f64]) {
+    let mut products = StepDerivative::new(&plant.model().clone());
+    plant.linearize(u, out).unwrap();
+    plant.differentiate(u, &mut products).unwrap();
+    let (a, b) = (out.a(), out.b());
+    let waves = |count, phase| DVector::from_fn(count, |i, _| wave(i + phase));
+    let (x, u, z) = (waves(a.ncols(), 1), waves(b.ncols(), 2), waves(a.nrows(), 3));
+    let close = |found: Vec<f64>, expected: DVector<f64>| {
+        let off = (DVector::from_vec(found) - &expected).amax();
+        assert!(off <= 1e-10 * expected.amax(), "{off:e} {:e}", expected.amax());
+    };
+    let mut next = vec![f64::NAN; a.nrows()];
+    products.push_forward(x.as_slice(), u.as_slice(), &mut next);
+    close(next, &a * &x + &b * &u);
+    let (mut by_x, mut by_u) = (vec![f64::NAN; a.ncols()], vec![f64::NAN; b.ncols()]);
+    products.pull_back(z.as_slice(), &mut by_x, &mut by_u);
+    close(by_x, a.tr_mul(&z));
+    close(by_u, b.tr_mul(&z));
 }
 
 fn apart(a: &[f64], b: &[f64]) -> f64 {
