@@ -1,5 +1,6 @@
-//! How the time of a step, of A and B, of products with them, and the memory of a plant grow with a rope in space that has what sends other
-//! programs to dense matrices: a top that is moved, a ball joint, and a spring from its tip to the world.
+//! How the time of a step, of A and B, of products with them, and the memory of a plant grow with a rope in space that
+//! has what sends other programs to dense matrices: a top that is moved, a ball joint, and a spring from its tip to the
+//! world.
 //!
 //! `cargo run --release -p plantd-models --example growth`; in place of the spring to the world, with `-- braced` springs
 //! all along, each over two of the joints, with `-- tied` an elastic tendon over five rods, and with `-- pinned` a tip

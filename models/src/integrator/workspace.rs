@@ -110,7 +110,7 @@ impl ConstraintPair {
 #[derive(Clone, Debug)]
 pub(crate) struct Tangents {
     pub(crate) diagonals: Diagonals,
-    /// `Σ λ D²h`.
+    /// `Σ λ D²h`; without room until it is needed, where it bends.
     pub(crate) constraint_hessian: Vec<f64>,
     /// `½h L_qq + L_qv`; without room until they are needed, where generators stand for them.
     pub(crate) end_slopes: Vec<f64>,
@@ -131,10 +131,16 @@ impl Tangents {
     /// Makes room for a linearization entry by entry.
     pub(crate) fn make_room(&mut self, model: &Model) {
         let (nd, joints) = (model.dimensions.dynamic, model.dynamics.joints.len());
+        self.make_room_for_hessian(model);
         self.end_slopes.resize(nd * nd, 0.0);
         if !model.orientations.is_empty() {
             self.flanks.resize(joints, Flanks::default());
         }
+    }
+
+    fn make_room_for_hessian(&mut self, model: &Model) {
+        let (n, nc) = (model.dimensions.coordinates(), model.dimensions.constraints);
+        self.constraint_hessian.resize(if nc > 0 { n * n } else { 0 }, 0.0);
     }
 
     /// Makes room for what a linearization by generators needs beside them, with rows that are so long.
@@ -143,6 +149,9 @@ impl Tangents {
             self.bending = Bending::new(model, stride).map(Box::new);
             let (nc, has_hessian) = (model.dimensions.constraints, self.bending.is_none());
             self.pushes = Pushes::new(model, stride, nc, has_hessian);
+            if has_hessian {
+                self.make_room_for_hessian(model);
+            }
         }
         if model.has_ties {
             self.tied = Some(Box::new(TiedTangents::new(model, stride)));
@@ -159,7 +168,7 @@ impl Workspace {
         let kkt = KktSystem::new(model, stride);
         let mut tangents = Tangents {
             diagonals: Diagonals::new(nd),
-            constraint_hessian: zeros(if nc > 0 { n * n } else { 0 }),
+            constraint_hessian: Vec::new(),
             end_slopes: Vec::new(),
             flanks: Vec::new(),
             balls: vec![OfBall::ZERO; model.orientations.len()],

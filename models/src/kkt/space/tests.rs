@@ -10,7 +10,7 @@ use plantd_scene::{CoordinateKind, Scene, builtin};
 
 use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
-use crate::integrator::workspace::Workspace;
+use crate::integrator::workspace::{StepContext, Workspace};
 use crate::kkt::space::Spatial;
 use crate::kkt::space::derivatives::Derivatives;
 use crate::kkt::system::{Linearized, Recursion};
@@ -395,7 +395,11 @@ fn move_alike(model: &Arc<Model>, steps: u32) -> Plant {
 fn assert_products(plant: &mut Plant, out: &mut Linearization, u: &[f64]) {
     let mut products = StepDerivative::new(&plant.model().clone());
     plant.linearize(u, out).unwrap();
-    plant.differentiate(u, &mut products).unwrap();
+    plant.solve(u, None).unwrap();
+    let Plant { model, settings, state, workspace, period } = plant;
+    let u = period.input.of_step(model, state, settings.time_step_s, u, [0.0, 1.0]).unwrap();
+    workspace.differentiate(StepContext { model, settings, state, u }, &mut products).unwrap();
+    assert!(products.is_there());
     let (a, b) = (out.a(), out.b());
     let waves = |count, phase| DVector::from_fn(count, |i, _| wave(i + phase));
     let (x, u, z) = (waves(a.ncols(), 1), waves(b.ncols(), 2), waves(a.nrows(), 3));
