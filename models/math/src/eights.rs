@@ -12,6 +12,7 @@ use crate::eights::registers::{Halves, Whole};
 use crate::rows::{Block, LANES, sum_of_eight};
 #[cfg(target_arch = "x86_64")]
 use crate::simd::{AVX2, AVX512, has};
+use crate::unrolled;
 
 /// A one in each place.
 pub const UNITS: [Block; LANES] = {
@@ -78,7 +79,7 @@ pub trait Eight: Copy + 'static {
     /// The way back.
     #[inline(always)]
     fn collect(rows: &[Block]) -> [Self; 8] {
-        let mut eight = [Self::ZERO; 8];
+        let mut eight = const { [Self::ZERO; 8] };
         for (own, row) in eight.iter_mut().zip(rows) {
             *own = Self::of(row);
         }
@@ -87,7 +88,7 @@ pub trait Eight: Copy + 'static {
     /// [`Eight::spread`] to the rows that are named.
     #[inline(always)]
     fn spread_to(numbers: [Self; 8], rows: &mut [Block], of: &[usize]) {
-        let mut eight = [Block::ZERO; 8];
+        let mut eight = const { [Block::ZERO; 8] };
         Self::spread(numbers, &mut eight);
         for (own, row) in eight.into_iter().zip(of) {
             rows[*row] = own;
@@ -96,7 +97,7 @@ pub trait Eight: Copy + 'static {
     /// [`Eight::collect`] from the rows that are named.
     #[inline(always)]
     fn collect_from(rows: &[Block], of: &[usize]) -> [Self; 8] {
-        let mut eight = [Block::ZERO; 8];
+        let mut eight = const { [Block::ZERO; 8] };
         for (own, row) in eight.iter_mut().zip(of) {
             *own = rows[*row];
         }
@@ -169,40 +170,46 @@ impl Eight for Block {
     }
     #[inline(always)]
     fn all(number: f64) -> Self {
-        Self([number; 8])
+        let mut block = Self::ZERO;
+        unrolled!(8, i < 8, { block.0[i] = number });
+        block
     }
     #[inline(always)]
-    fn plus(self, o: Self) -> Self {
-        Self(std::array::from_fn(|i| self.0[i] + o.0[i]))
+    fn plus(mut self, o: Self) -> Self {
+        unrolled!(8, i < 8, { self.0[i] += o.0[i] });
+        self
     }
     #[inline(always)]
-    fn minus(self, o: Self) -> Self {
-        Self(std::array::from_fn(|i| self.0[i] - o.0[i]))
+    fn minus(mut self, o: Self) -> Self {
+        unrolled!(8, i < 8, { self.0[i] -= o.0[i] });
+        self
     }
     #[inline(always)]
-    fn times(self, o: Self) -> Self {
-        Self(std::array::from_fn(|i| self.0[i] * o.0[i]))
+    fn times(mut self, o: Self) -> Self {
+        unrolled!(8, i < 8, { self.0[i] *= o.0[i] });
+        self
     }
     #[inline(always)]
-    fn over(self, o: Self) -> Self {
-        Self(std::array::from_fn(|i| self.0[i] / o.0[i]))
+    fn over(mut self, o: Self) -> Self {
+        unrolled!(8, i < 8, { self.0[i] /= o.0[i] });
+        self
     }
     #[inline(always)]
-    fn sqrt(self) -> Self {
-        Self(std::array::from_fn(|i| self.0[i].sqrt()))
+    fn sqrt(mut self) -> Self {
+        unrolled!(8, i < 8, { self.0[i] = self.0[i].sqrt() });
+        self
     }
     #[inline(always)]
-    fn signed(self, o: Self) -> Self {
-        Self(std::array::from_fn(|i| self.0[i].copysign(o.0[i])))
+    fn signed(mut self, o: Self) -> Self {
+        unrolled!(8, i < 8, { self.0[i] = self.0[i].copysign(o.0[i]) });
+        self
     }
     #[inline(always)]
     fn transposed(rows: [Self; 8]) -> [Self; 8] {
         let mut out = rows;
-        for (i, row) in out.iter_mut().enumerate() {
-            for (entry, from) in row.0.iter_mut().zip(&rows) {
-                *entry = from.0[i];
-            }
-        }
+        unrolled!(8, i < 8, {
+            unrolled!(8, k < 8, { out[i].0[k] = rows[k].0[i] });
+        });
         out
     }
     #[inline(always)]

@@ -20,3 +20,4 @@ pub mod spline;
 pub mod sums;
 pub mod tree_lu;
 pub mod trigonometry;
+pub mod unrolled;

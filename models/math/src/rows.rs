@@ -2,6 +2,8 @@
 
 use std::ops::{Add, Deref, DerefMut};
 
+use crate::unrolled;
+
 /// Rows are padded to a multiple of this, and worked on in blocks of it.
 pub const LANES: usize = 8;
 
@@ -18,9 +20,7 @@ impl Block {
     #[inline(always)]
     pub fn plus(self, o: Self) -> Self {
         let mut sum = self.0;
-        for (sum, part) in sum.iter_mut().zip(o.0) {
-            *sum += part;
-        }
+        unrolled!(8, i < LANES, { sum[i] += o.0[i] });
         Self(sum)
     }
 
@@ -28,9 +28,7 @@ impl Block {
     #[inline(always)]
     pub fn times(self, factor: f64) -> Self {
         let mut product = self.0;
-        for entry in &mut product {
-            *entry *= factor;
-        }
+        unrolled!(8, i < LANES, { product[i] *= factor });
         Self(product)
     }
 }

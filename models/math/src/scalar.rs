@@ -12,6 +12,7 @@ use crate::eights::Eight;
 use crate::rows::{Block, sum_of_eight};
 use crate::simd::{AVX512, has, in_avx512, wide};
 use crate::trigonometry;
+use crate::unrolled;
 
 pub use beside::{Beside, Wide};
 use beside::{in_one, in_plants, in_sides};
@@ -406,26 +407,22 @@ impl<const N: usize> LanesOf<N> {
 
     #[inline(always)]
     fn each(mut self, f: impl Fn(f64) -> f64) -> Self {
-        for x in &mut self.0 {
-            *x = f(*x);
-        }
+        unrolled!(8, i < N, { self.0[i] = f(self.0[i]) });
         self
     }
 
     #[inline(always)]
     fn with(mut self, other: Self, f: impl Fn(f64, f64) -> f64) -> Self {
-        for (x, y) in self.0.iter_mut().zip(other.0) {
-            *x = f(*x, y);
-        }
+        unrolled!(8, i < N, { self.0[i] = f(self.0[i], other.0[i]) });
         self
     }
 
     #[inline(always)]
     fn compare(self, other: Self, f: impl Fn(f64, f64) -> bool) -> Truths<N> {
-        let mut truths = [0; N];
-        for ((truth, x), y) in truths.iter_mut().zip(self.0).zip(other.0) {
-            *truth = if f(x, y) { u64::MAX } else { 0 };
-        }
+        let mut truths = const { [0; N] };
+        unrolled!(8, i < N, {
+            truths[i] = if f(self.0[i], other.0[i]) { u64::MAX } else { 0 };
+        });
         Truths(truths)
     }
 }
@@ -441,7 +438,9 @@ impl<const N: usize> Scalar for LanesOf<N> {
     const IS_SEVERAL: bool = true;
     #[inline(always)]
     fn constant(value: f64) -> Self {
-        Self([value; N])
+        let mut lanes = Self::ZERO;
+        unrolled!(8, i < N, { lanes.0[i] = value });
+        lanes
     }
     #[inline(always)]
     fn in_registers<R>(block: impl FnOnce() -> R) -> R {
@@ -553,9 +552,7 @@ impl<const N: usize> Truths<N> {
     }
     #[inline(always)]
     fn with(mut self, other: Self, f: impl Fn(u64, u64) -> u64) -> Self {
-        for (x, y) in self.0.iter_mut().zip(other.0) {
-            *x = f(*x, y);
-        }
+        unrolled!(8, i < N, { self.0[i] = f(self.0[i], other.0[i]) });
         self
     }
 }
@@ -588,7 +585,7 @@ impl<const N: usize> Compared for LanesOf<N> {
     type Truth = Truths<N>;
     #[inline(always)]
     fn all(truth: bool) -> Truths<N> {
-        Truths([if truth { u64::MAX } else { 0 }; N])
+        if truth { const { Truths([u64::MAX; N]) } } else { const { Truths([0; N]) } }
     }
     #[inline(always)]
     fn any(truth: Truths<N>) -> bool {
@@ -605,9 +602,10 @@ impl<const N: usize> Compared for LanesOf<N> {
     #[inline(always)]
     fn choose(truth: Truths<N>, yes: Self, no: Self) -> Self {
         let mut chosen = no;
-        for ((no, yes), truth) in chosen.0.iter_mut().zip(yes.0).zip(truth.0) {
-            *no = f64::from_bits((yes.to_bits() & truth) | (no.to_bits() & !truth));
-        }
+        unrolled!(8, i < N, {
+            let [yes, no] = [yes.0[i].to_bits(), no.0[i].to_bits()];
+            chosen.0[i] = f64::from_bits((yes & truth.0[i]) | (no & !truth.0[i]));
+        });
         chosen
     }
     #[inline(always)]

@@ -7,6 +7,8 @@
 
 use std::f64::consts::FRAC_2_PI;
 
+use crate::unrolled;
+
 /// Angles up to this are reduced here; larger ones, and what is not finite, by `libm`.
 const LARGEST: f64 = 1e6;
 
@@ -79,10 +81,10 @@ pub fn sin_cos(angles: &[f64], out: &mut [[f64; 2]]) {
 #[inline(always)]
 pub fn sin_cos_of_several<const N: usize>(angles: [f64; N]) -> [[f64; N]; 2] {
     let ([mut sines, mut cosines], mut all_small) = ([[0.0; N]; 2], true);
-    for (i, angle) in angles.iter().enumerate() {
-        all_small &= angle.abs() <= LARGEST;
-        [sines[i], cosines[i]] = reduced(*angle);
-    }
+    unrolled!(8, i < N, {
+        all_small &= angles[i].abs() <= LARGEST;
+        [sines[i], cosines[i]] = reduced(angles[i]);
+    });
     if all_small { [sines, cosines] } else { sin_cos_one_by_one(angles) }
 }
 

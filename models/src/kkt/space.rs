@@ -36,6 +36,7 @@ use std::ops::Range;
 
 use plantd_math::eights::{Eight, InEights, in_eights};
 use plantd_math::tree_lu::SmallestPivot;
+use plantd_math::unrolled;
 
 use crate::kkt::space::lines::{InLine, Line, Lines, combined};
 use crate::kkt::space::vectors::Vectors;
@@ -186,73 +187,65 @@ struct Both<'a, E, const B: usize> {
 impl<E: Eight, const B: usize> Sums<E, B> {
     #[inline(always)]
     fn zero() -> Self {
-        Self { rows: [[InLine::ZERO; 8]; B] }
+        Self { rows: const { [[InLine::ZERO; 8]; B] } }
     }
 
     /// The first blocks of what has more.
     #[inline(always)]
     fn of<const L: usize>(rows: &Kept<L>) -> Self {
         let mut sums = Self::zero();
-        for (own, rows) in sums.rows.iter_mut().zip(rows) {
-            for (own, row) in own.iter_mut().zip(rows) {
-                *own = InLine::of(row);
-            }
-        }
+        unrolled!(3, b < B, {
+            unrolled!(8, k < 8, { sums.rows[b][k] = InLine::of(&rows[b][k]) });
+        });
         sums
     }
 
     #[inline(always)]
     fn columns(&self) -> Lines<E, B> {
-        let mut columns = [[InLine::ZERO; 8]; B];
-        for (b, columns) in columns.iter_mut().enumerate() {
-            for (c, rows) in self.rows.iter().enumerate() {
-                let mut block = [E::ZERO; 8];
-                for (own, row) in block.iter_mut().zip(rows) {
-                    *own = row.0[b];
-                }
-                for (column, turned) in columns.iter_mut().zip(E::transposed(block)) {
-                    column.0[c] = turned;
-                }
-            }
-        }
+        let mut columns = const { [[InLine::ZERO; 8]; B] };
+        unrolled!(3, b < B, {
+            unrolled!(3, c < B, {
+                let mut block = const { [E::ZERO; 8] };
+                unrolled!(8, k < 8, { block[k] = self.rows[c][k].0[b] });
+                let turned = E::transposed(block);
+                unrolled!(8, k < 8, { columns[b][k].0[c] = turned[k] });
+            });
+        });
         columns
     }
 
     #[inline(always)]
     fn plus(mut self, o: &Self) -> Self {
-        for b in 0..B {
-            for k in 0..8 {
-                self.rows[b][k] = self.rows[b][k].plus(o.rows[b][k]);
-            }
-        }
+        unrolled!(3, b < B, {
+            unrolled!(8, k < 8, { self.rows[b][k] = self.rows[b][k].plus(o.rows[b][k]) });
+        });
         self
     }
 
     /// Leaves the first block alone.
     #[inline(always)]
     fn end(&mut self) {
-        for (b, lines) in self.rows.iter_mut().enumerate() {
-            for line in lines {
+        unrolled!(3, b < B, {
+            unrolled!(8, k < 8, {
+                let line = &mut self.rows[b][k];
                 *line = if b == 0 { line.ended() } else { InLine::ZERO };
-            }
-        }
+            });
+        });
     }
 
     /// To the first blocks of what has more.
     #[inline(always)]
     fn put<const L: usize>(&self, rows: &mut Kept<L>) {
-        for (own, rows) in self.rows.iter().zip(rows) {
-            for (own, row) in own.iter().zip(rows) {
-                own.put(row);
-            }
-        }
+        unrolled!(3, b < B, {
+            unrolled!(8, k < 8, { self.rows[b][k].put(&mut rows[b][k]) });
+        });
     }
 }
 
 /// The inverse of a matrix by rows, and the pivots of its elimination from the last row to the first.
 #[inline(always)]
 fn inverse<const W: usize>(d: &[[f64; W]; W]) -> ([[f64; W]; W], [f64; W]) {
-    let (mut inverse, mut pivots) = ([[0.0; W]; W], [0.0; W]);
+    let (mut inverse, mut pivots) = const { ([[0.0; W]; W], [0.0; W]) };
     match W {
         1 => {
             pivots[0] = d[0][0];
@@ -278,11 +271,9 @@ fn inverse<const W: usize>(d: &[[f64; W]; W]) -> ([[f64; W]; W], [f64; W]) {
             let first = minor(0, 0);
             let determinant = d[0][0] * first + d[0][1] * minor(0, 1) + d[0][2] * minor(0, 2);
             let scale = 1.0 / determinant;
-            for (a, row) in inverse.iter_mut().enumerate() {
-                for (b, entry) in row.iter_mut().enumerate() {
-                    *entry = minor(b, a) * scale;
-                }
-            }
+            unrolled!(3, a < W, {
+                unrolled!(3, b < W, { inverse[a][b] = minor(b, a) * scale });
+            });
             pivots[0] = determinant / first;
             pivots[1] = first / d[2][2];
             pivots[2] = d[2][2];
@@ -602,7 +593,7 @@ impl<const B: usize> SpatialRecursion<B> {
             if !is_first {
                 sums = sums.plus(&Sums::of(all));
             } else if U < B {
-                *all = [[Line::ZERO; 8]; B];
+                *all = const { [[Line::ZERO; 8]; B] };
             }
             sums.put(all);
         }
@@ -616,14 +607,17 @@ fn write_within<E: Eight, const B: usize, const U: usize, const W: usize>(
     diagonal: &[f64],
     within: &mut Square,
 ) {
-    for (a, above) in axes.iter().enumerate() {
+    unrolled!(3, a < W, {
+        let above = axes[a];
         let (minus, plus) = (InLine::<E, U>::of(&above.minus), InLine::<E, U>::of(&above.plus));
         within[a][a] = minus.dot(InLine::of(&above.upper)) + diagonal[a];
-        for (b, below) in axes.iter().enumerate().skip(a + 1) {
-            within[a][b] = minus.dot(InLine::of(&below.upper));
-            within[b][a] = plus.dot(InLine::of(&below.lower));
-        }
-    }
+        unrolled!(3, b < W, {
+            if b > a {
+                within[a][b] = minus.dot(InLine::of(&axes[b].upper));
+                within[b][a] = plus.dot(InLine::of(&axes[b].lower));
+            }
+        });
+    });
 }
 
 /// Eliminates the axes of a group, with the columns of `A` where it is not zero; `see` takes an axis, its pivot, and
@@ -636,49 +630,51 @@ fn eliminate<E: Eight, const B: usize, const U: usize, const W: usize>(
     is_root: bool,
     mut see: impl FnMut(usize, f64, f64),
 ) {
-    let mut d = [[0.0; W]; W];
-    let [mut u, mut w] = [[InLine::<E, U>::ZERO; W]; 2];
-    for a in 0..W {
-        d[a].copy_from_slice(&within[a][..W]);
+    let mut d = const { [[0.0; W]; W] };
+    let [mut u, mut w] = const { [[InLine::<E, U>::ZERO; W]; 2] };
+    unrolled!(3, a < W, {
+        unrolled!(3, b < W, { d[a][b] = within[a][b] });
         u[a] = InLine::of(&axes[a].upper);
         w[a] = InLine::of(&axes[a].lower);
-    }
+    });
     if let Some(columns) = columns {
-        for b in 0..W {
+        unrolled!(3, b < W, {
             let product = combined(columns, &axes[b].plus);
             u[b] = u[b].plus(product);
             w[b] = w[b].plus(combined(&sums.rows, &axes[b].minus));
-            for (row, axis) in d.iter_mut().zip(&axes) {
-                row[b] += InLine::of(&axis.minus).dot(product);
-            }
-        }
+            unrolled!(3, a < W, { d[a][b] += InLine::of(&axes[a].minus).dot(product) });
+        });
     }
     let (inverse, pivots) = inverse(&d);
-    for a in (0..W).rev() {
+    unrolled!(3, after < W, {
+        let a = W - 1 - after;
         see(a, pivots[a], within[a][a]);
-    }
-    let mut w_over_d = [InLine::<E, U>::ZERO; W];
-    for a in 0..W {
+    });
+    let mut w_over_d = const { [InLine::<E, U>::ZERO; W] };
+    unrolled!(3, a < W, {
         w_over_d[a] = w[0].scaled(inverse[a][0]);
-        for b in 1..W {
-            w_over_d[a] = w_over_d[a].plus(w[b].scaled(inverse[a][b]));
-        }
+        unrolled!(3, b < W, {
+            if b > 0 {
+                w_over_d[a] = w_over_d[a].plus(w[b].scaled(inverse[a][b]));
+            }
+            within[a][b] = inverse[a][b];
+        });
         u[a].put(&mut axes[a].upper);
         w_over_d[a].put(&mut axes[a].lower);
-        within[a][..W].copy_from_slice(&inverse[a]);
-    }
+    });
     if is_root {
         return;
     }
     // Number by number from memory, where compilers would take the registers apart.
     let axes: &[&mut Generators<Line<B>>; W] = black_box(&axes);
-    for (b, rows) in sums.rows.iter_mut().enumerate() {
-        for (k, row) in rows.iter_mut().enumerate() {
-            for a in 0..W {
+    unrolled!(3, b < U, {
+        unrolled!(8, k < 8, {
+            let row = &mut sums.rows[b][k];
+            unrolled!(3, a < W, {
                 *row = row.minus(w_over_d[a].scaled(axes[a].upper.0[b].0[k]));
-            }
-        }
-    }
+            });
+        });
+    });
 }
 
 /// A solution.
@@ -868,19 +864,19 @@ fn lift<E: Eight, const B: usize, const U: usize, const W: usize>(
     inverse: &Square,
     flow: InLine<E, U>,
 ) -> InLine<E, U> {
-    let mut b = [0.0; W];
-    for a in 0..W {
-        b[a] = *x[a] - InLine::of(&axes[a].minus).dot(flow);
-    }
+    let mut b = const { [0.0; W] };
+    unrolled!(3, a < W, { b[a] = *x[a] - InLine::of(&axes[a].minus).dot(flow) });
     let mut next = flow;
-    for a in 0..W {
+    unrolled!(3, a < W, {
         let mut value = inverse[a][0] * b[0];
-        for c in 1..W {
-            value += inverse[a][c] * b[c];
-        }
+        unrolled!(3, c < W, {
+            if c > 0 {
+                value += inverse[a][c] * b[c];
+            }
+        });
         *x[a] = value;
         next = next.plus(InLine::of(&axes[a].upper).scaled(value));
-    }
+    });
     next
 }
 
@@ -892,9 +888,9 @@ fn lower<E: Eight, const B: usize, const U: usize, const W: usize>(
     flow: InLine<E, U>,
 ) -> InLine<E, U> {
     let mut next = flow;
-    for (x, axis) in x.into_iter().zip(axes) {
-        *x -= InLine::of(&axis.lower).dot(flow);
-        next = next.plus(InLine::of(&axis.plus).scaled(*x));
-    }
+    unrolled!(3, a < W, {
+        *x[a] -= InLine::of(&axes[a].lower).dot(flow);
+        next = next.plus(InLine::of(&axes[a].plus).scaled(*x[a]));
+    });
     next
 }

@@ -43,6 +43,7 @@
 use plantd_math::eights::Eight;
 use plantd_math::rows::Block;
 use plantd_math::spatial::Mat3;
+use plantd_math::unrolled;
 
 use crate::lagrangian::curvature::Curvature;
 use crate::lagrangian::turning::{Turning, Weights};
@@ -95,9 +96,7 @@ fn sum<E: Eight>([a, b, c]: &[E; 3], weights: [f64; 3]) -> E {
 pub(crate) fn rows<E: Eight>(m: &Mat3, vectors: &[E; 3]) -> [E; 3] {
     let Mat3([x, y, z]) = m;
     let mut out = *vectors;
-    for (a, out) in out.iter_mut().enumerate() {
-        *out = sum(vectors, [x[a], y[a], z[a]]);
-    }
+    unrolled!(3, a < 3, { out[a] = sum(vectors, [x[a], y[a], z[a]]) });
     out
 }
 
@@ -105,9 +104,7 @@ pub(crate) fn rows<E: Eight>(m: &Mat3, vectors: &[E; 3]) -> [E; 3] {
 #[inline(always)]
 pub(crate) fn columns<E: Eight>(m: &Mat3, vectors: &[E; 3]) -> [E; 3] {
     let mut out = *vectors;
-    for (column, out) in m.0.iter().zip(&mut out) {
-        *out = sum(vectors, column.0);
-    }
+    unrolled!(3, a < 3, { out[a] = sum(vectors, m.0[a].0) });
     out
 }
 
@@ -186,22 +183,20 @@ pub(crate) fn of_ball<E: Eight>(
     let [axes, forces] = [rows(momentum, &axis), rows(momentum, &force)];
     let [rate, slope] = [columns(column, &rate), columns(column, &slope)];
     let mut generators = [p.generators(), q.generators(), r.generators()];
-    for (a, generators) in generators.iter_mut().enumerate() {
-        *generators = Generators {
+    let mut within = [[0.0; 3]; 3];
+    unrolled!(3, a < 3, {
+        generators[a] = Generators {
             minus: rates[a].minus(axes[a]),
             plus: rate[a].plus(axis[a]),
             upper: slope[a].plus(force[a]),
             lower: slopes[a].minus(forces[a]),
         };
-    }
-    let mut within = [[0.0; 3]; 3];
-    for (a, row) in within.iter_mut().enumerate() {
-        for (b, entry) in row.iter_mut().enumerate() {
+        unrolled!(3, b < 3, {
             let turned = generators[a].lower.times(rate[b]);
             let moved = rates[a].times(force[b]).minus(forces[a].times(axis[b]));
-            *entry = turned.plus(moved).sum() + own.0[b].0[a];
-        }
-    }
+            within[a][b] = turned.plus(moved).sum() + own.0[b].0[a];
+        });
+    });
     (generators, within)
 }
 
@@ -245,11 +240,12 @@ impl<E: Eight> Flanks<E> {
         let axes = rows(&spin, &[p.axis, q.axis, r.axis]);
         let forces = rows(&spin, &[p.force, q.force, r.force]);
         let (above, below) = (columns(start, &rate), columns(start, &slope));
-        for (a, own) in flanks.iter_mut().enumerate() {
+        unrolled!(3, a < 3, {
+            let own = &mut flanks[a];
             (own.is_turned, own.newton) = (true, newton[a]);
             (own.carry, own.push) = (rate[a].plus(axes[a]), slope[a].plus(forces[a]));
             (own.above, own.below) = (above[a], below[a]);
-        }
+        });
         flanks
     }
 

@@ -103,7 +103,10 @@ struct ClosedTree {
 #[derive(Debug)]
 enum Bent {
     Nothing,
-    Products { bends: Bends, sums: Sums<1> },
+    Products {
+        bends: Bends,
+        sums: Sums<1>,
+    },
     /// Row-major.
     Filled(Vec<f64>),
 }

@@ -5,6 +5,7 @@ use std::arch::x86_64::*;
 
 use crate::eights::Eight;
 use crate::rows::Block;
+use crate::unrolled;
 
 /// A register of eight numbers, of AVX-512.
 #[derive(Clone, Copy)]
@@ -218,7 +219,8 @@ impl Eight for Halves {
     }
     #[inline(always)]
     fn all(number: f64) -> Self {
-        Self([Low::all(number); 2])
+        let half = Low::all(number);
+        Self([half, half])
     }
     #[inline(always)]
     fn plus(self, o: Self) -> Self {
@@ -255,9 +257,9 @@ impl Eight for Halves {
         let r = Low::transposed_four([a.0[1], b.0[1], c.0[1], d.0[1]]);
         let s = Low::transposed_four([e.0[1], f.0[1], g.0[1], h.0[1]]);
         let mut out = [a, b, c, d, e, f, g, h];
-        for i in 0..4 {
+        unrolled!(8, i < 4, {
             (out[i], out[i + 4]) = (Self([p[i], q[i]]), Self([r[i], s[i]]));
-        }
+        });
         out
     }
 }

@@ -134,13 +134,13 @@ fn add_moved<E: Eight, const B: usize, const U: usize>(
 #[inline(always)]
 fn end<E: Eight, const B: usize>(flow: &mut Flow<E, B>) {
     for own in &mut flow[1..] {
-        *own = [E::ZERO; 8];
+        *own = const { [E::ZERO; 8] };
     }
 }
 
 #[inline(always)]
 fn of_blocks<E: Eight, const B: usize, const U: usize>(blocks: &Flow<Block, B>) -> Flow<E, U> {
-    let mut all = [[E::ZERO; 8]; U];
+    let mut all = const { [[E::ZERO; 8]; U] };
     for (all, blocks) in all.iter_mut().zip(blocks) {
         for (own, block) in all.iter_mut().zip(blocks) {
             *own = E::of(block);
@@ -200,7 +200,7 @@ impl<const B: usize> Columns<B> {
         let SpatialRecursion { groups, axes, within, .. } = recursion;
         let n = axes.len();
         let Limb { carries, hangs_from, .. } = limb;
-        let mut flow = [[E::ZERO; 8]; U];
+        let mut flow = const { [[E::ZERO; 8]; U] };
         if let Some(place) = *carries {
             flow = of_blocks(&self.flows[place]);
             self.flows[place] = [[Block::ZERO; 8]; B];
@@ -281,7 +281,7 @@ impl<const B: usize> Columns<B> {
         let Limb { groups: own, carries, hangs_from, .. } = limb;
         let mut motion = match hangs_from {
             Some(fork) => of_blocks::<E, B, U>(&self.motions[fork.place]),
-            None => [[E::ZERO; 8]; U],
+            None => const { [[E::ZERO; 8]; U] },
         };
         for at in own.clone().rev() {
             let Group { axes: range, rows: own, kind, is_end, .. } = &groups[at];
@@ -345,7 +345,7 @@ impl<const B: usize> Lifted<'_, B> {
         flow: &mut Flow<E, U>,
     ) {
         let Self { margins, among, inverse, increment, momentum, columns, first } = self;
-        let [mut residual, mut carried] = [[E::ZERO; W]; 2];
+        let [mut residual, mut carried] = const { [[E::ZERO; W]; 2] };
         for a in 0..W {
             residual[a] = product(&axes[a].minus, flow);
             carried[a] = product(&margins[a].carry, flow);
@@ -396,7 +396,7 @@ impl<const B: usize> Lowered<'_, B> {
         rows: &mut Rows<'_>,
     ) {
         let Self { margins, among, increment, momentum, start, first } = self;
-        let [mut x, mut p] = [[E::ZERO; W]; 2];
+        let [mut x, mut p] = const { [[E::ZERO; W]; 2] };
         for a in 0..W {
             x[a] = E::of(&increment[a]).minus(product(&axes[a].lower, motion));
             p[a] = E::of(&momentum[a]).plus(product(&margins[a].push, motion));

@@ -2,6 +2,7 @@
 
 use plantd_math::eights::Eight;
 use plantd_math::rows::Block;
+use plantd_math::unrolled;
 
 /// In memory.
 #[derive(Clone, Copy, Debug)]
@@ -30,14 +31,9 @@ impl<E: Eight, const B: usize> InLine<E, B> {
     /// Of a first block and, where there are more, a second and a third.
     #[inline(always)]
     pub(crate) fn new(first: E, second: E, third: E) -> Self {
-        let mut blocks = [first; B];
-        if let [_, own, ..] = &mut blocks[..] {
-            *own = second;
-        }
-        if let [_, _, own] = &mut blocks[..] {
-            *own = third;
-        }
-        Self(blocks)
+        let mut all = Self::ZERO;
+        unrolled!(3, b < B, { all.0[b] = [first, second, third][b] });
+        all
     }
 
     /// To a line, whose other blocks become zero.
@@ -58,55 +54,43 @@ impl<E: Eight, const B: usize> InLine<E, B> {
     /// The first blocks of a line that has more.
     #[inline(always)]
     pub(crate) fn of<const L: usize>(line: &Line<L>) -> Self {
-        let mut blocks = [E::ZERO; B];
-        for (own, block) in blocks.iter_mut().zip(&line.0) {
-            *own = E::of(block);
-        }
-        Self(blocks)
+        let mut all = Self::ZERO;
+        unrolled!(3, b < B, { all.0[b] = E::of(&line.0[b]) });
+        all
     }
 
     /// To the first blocks of a line that has more.
     #[inline(always)]
     pub(crate) fn put<const L: usize>(self, line: &mut Line<L>) {
-        for (own, block) in self.0.into_iter().zip(&mut line.0) {
-            own.put(block);
-        }
+        unrolled!(3, b < B, { self.0[b].put(&mut line.0[b]) });
     }
 
     #[inline(always)]
     pub(crate) fn plus(mut self, o: Self) -> Self {
-        for (own, other) in self.0.iter_mut().zip(o.0) {
-            *own = own.plus(other);
-        }
+        unrolled!(3, b < B, { self.0[b] = self.0[b].plus(o.0[b]) });
         self
     }
 
     #[inline(always)]
     pub(crate) fn minus(mut self, o: Self) -> Self {
-        for (own, other) in self.0.iter_mut().zip(o.0) {
-            *own = own.minus(other);
-        }
+        unrolled!(3, b < B, { self.0[b] = self.0[b].minus(o.0[b]) });
         self
     }
 
     #[inline(always)]
     pub(crate) fn scaled(mut self, factor: f64) -> Self {
-        for own in &mut self.0 {
-            *own = own.scaled(factor);
-        }
+        unrolled!(3, b < B, { self.0[b] = self.0[b].scaled(factor) });
         self
     }
 
     #[inline(always)]
     pub(crate) fn dot(self, o: Self) -> f64 {
-        let mut products = self.0;
-        for (own, other) in products.iter_mut().zip(o.0) {
-            *own = own.times(other);
-        }
-        let mut sum = products[0];
-        for more in &products[1..] {
-            sum = sum.plus(*more);
-        }
+        let mut sum = self.0[0].times(o.0[0]);
+        unrolled!(3, b < B, {
+            if b > 0 {
+                sum = sum.plus(self.0[b].times(o.0[b]));
+            }
+        });
         sum.sum()
     }
 }
@@ -118,13 +102,11 @@ pub(crate) fn combined<E: Eight, const B: usize, const L: usize>(
     v: &Line<L>,
 ) -> InLine<E, B> {
     let mut sum = InLine::ZERO;
-    for (b, (lines, Block(v))) in lines.iter().zip(&v.0).enumerate() {
-        let mut sums = [InLine::ZERO; 4];
-        for (k, sum) in sums.iter_mut().enumerate() {
-            *sum = lines[k].scaled(v[k]).plus(lines[k + 4].scaled(v[k + 4]));
-        }
-        let own = sums[0].plus(sums[2]).plus(sums[1].plus(sums[3]));
+    unrolled!(3, b < B, {
+        let (lines, Block(v)) = (&lines[b], &v.0[b]);
+        let two = |k: usize| lines[k].scaled(v[k]).plus(lines[k + 4].scaled(v[k + 4]));
+        let own = two(0).plus(two(2)).plus(two(1).plus(two(3)));
         sum = if b == 0 { own } else { sum.plus(own) };
-    }
+    });
     sum
 }

@@ -2,6 +2,7 @@
 
 use plantd_math::eights::Eight;
 use plantd_math::spatial::Mat3;
+use plantd_math::unrolled;
 
 use crate::kkt::planar::Diagonals;
 use crate::kkt::space::lines::{InLine, Line, combined};
@@ -150,25 +151,27 @@ fn write_among<E: Eight, const B: usize, const U: usize, const W: usize>(
     among: &mut Among,
     sums: Option<Both<'_, E, U>>,
 ) {
-    for a in 0..W {
+    unrolled!(3, a < W, {
         let [minus, plus] = [InLine::<E, U>::of(&axes[a].minus), InLine::of(&axes[a].plus)];
         let [carry, above] = [InLine::<E, U>::of(&margins[a].carry), InLine::of(&margins[a].above)];
-        for b in a..W {
-            let below = InLine::of(&margins[b].below);
-            among.residual[a][b] = minus.dot(below);
-            among.by_start[a][b] = carry.dot(below);
-            among.by_increment[a][b] = carry.dot(InLine::of(&axes[b].upper));
-        }
-        for b in a + 1..W {
-            let push = InLine::of(&margins[b].push);
-            among.residual[b][a] = above.dot(InLine::of(&axes[b].lower));
-            among.by_start[b][a] = above.dot(push);
-            among.by_increment[b][a] = plus.dot(push);
-        }
+        unrolled!(3, b < W, {
+            if b >= a {
+                let below = InLine::of(&margins[b].below);
+                among.residual[a][b] = minus.dot(below);
+                among.by_start[a][b] = carry.dot(below);
+                among.by_increment[a][b] = carry.dot(InLine::of(&axes[b].upper));
+            }
+            if b > a {
+                let push = InLine::of(&margins[b].push);
+                among.residual[b][a] = above.dot(InLine::of(&axes[b].lower));
+                among.by_start[b][a] = above.dot(push);
+                among.by_increment[b][a] = plus.dot(push);
+            }
+        });
         among.residual[a][a] += residual[a];
         among.by_start[a][a] += by_start[a];
         among.by_increment[a][a] += by_increment[a];
-    }
+    });
     if let Some(sums) = sums {
         include(axes, margins, among, sums);
     }
@@ -182,17 +185,17 @@ fn include<E: Eight, const B: usize, const U: usize, const W: usize>(
     among: &mut Among,
     sums: Both<'_, E, U>,
 ) {
-    for b in 0..W {
+    unrolled!(3, b < W, {
         let above = combined(sums.columns, &margins[b].above);
         let plus = combined(sums.columns, &axes[b].plus);
-        for a in 0..W {
+        unrolled!(3, a < W, {
             let carry = InLine::<E, U>::of(&margins[a].carry);
             among.residual[a][b] += InLine::of(&axes[a].minus).dot(above);
             among.by_start[a][b] += carry.dot(above);
             among.by_increment[a][b] += carry.dot(plus);
-        }
+        });
         let Margin { carry, push, below, .. } = &mut margins[b];
         InLine::of(below).plus(above).put(below);
         InLine::of(push).plus(combined(sums.rows, carry)).put(push);
-    }
+    });
 }

@@ -22,6 +22,7 @@
 
 use plantd_math::eights::Eight;
 use plantd_math::spatial::Mat3;
+use plantd_math::unrolled;
 
 use crate::kkt::space::Added;
 use crate::kkt::space::lines::{InLine, Line};
@@ -178,15 +179,15 @@ impl Vectors<'_> {
         let turn = rows(&weights.torque, &[p.turn, q.turn, r.turn]);
         let back = rows(&weights.torque, &[p.back, q.back, r.back]);
         let drag = [p.drag, q.drag, r.drag];
-        for (a, all) in all.iter_mut().enumerate() {
+        unrolled!(3, a < 3, {
             let own = &own[a];
-            *all = Generators {
+            all[a] = Generators {
                 minus: InLine::new(own.minus, minus[a], E::ZERO),
                 plus: InLine::new(own.plus, plus[a], own.plus),
                 upper: InLine::new(own.upper, pull[a].plus(drag[a]), E::ZERO),
                 lower: turned(own.lower, turn[a], back[a]),
             };
-        }
+        });
         (all, within)
     }
 
