@@ -14,12 +14,13 @@
 #[macro_export]
 macro_rules! unrolled {
     (3, $i:ident < $count:tt, $body:block) => {
-        $crate::unrolled!(@ $i $count $body 0 1 2)
+        $crate::unrolled!(@ 3 $i $count $body 0 1 2)
     };
     (8, $i:ident < $count:tt, $body:block) => {
-        $crate::unrolled!(@ $i $count $body 0 1 2 3 4 5 6 7)
+        $crate::unrolled!(@ 8 $i $count $body 0 1 2 3 4 5 6 7)
     };
-    (@ $i:ident $count:tt $body:block $($at:literal)*) => {
+    (@ $most:literal $i:ident $count:tt $body:block $($at:literal)*) => {
+        const { assert!($count <= $most, "more rounds than are written out") };
         $(if $at < $count {
             let $i: usize = $at;
             $body
