@@ -25,7 +25,7 @@ use crate::model::mechanism::Model;
 /// Of one step of the midpoint rule of a tree it takes O(n) to find and to apply, and O(n) of memory, where `A` and
 /// `B` take O(n²). Each of `m` equations of constraints, and of rows of what acts between two bodies of which none is
 /// above the other, along paths over several bodies and on sums of coordinates, takes another O(n) to apply and
-/// O(n m) to find, up to one for two coordinates. Springs, drag and forces at points and frames are taken with equal halves
+/// O(n m) to find, up to one for two dynamic coordinates. Springs, drag and forces at points and frames are taken with equal halves
 /// ([`ForceSplit::Symmetric`](crate::ForceSplit)) alone; points on planes and orientations that are held, whose
 /// second derivatives are filled, in O(n²). All else, lengths that are prescribed and armatures of sums among it, is by
 /// the matrices, to the same numbers. The memory is made by the first
@@ -121,12 +121,12 @@ struct Formed {
 
 /// Whether the derivative of one step of the midpoint rule is by generators.
 ///
-/// Each equation that closes the tree is another product. With as many as coordinates (`scissor-8` to `-64`), matrices
+/// Each equation that closes the tree is another product. With as many as dynamic coordinates (`scissor-8` to `-64`), matrices
 /// are found in the same time or less, and applied in a quarter of it; with three for 16 joints, products are found in
 /// 0.7 of the time, with three for 128 in 0.13.
 pub(crate) fn is_generated(model: &Model, settings: &Settings) -> bool {
     let d = model.dimensions;
-    let is_open = 2 * (d.constraints + model.tied_rows()) <= d.coordinates();
+    let is_open = 2 * (d.constraints + model.tied_rows()) <= d.dynamic;
     is_open && model.is_generated() && takes_split(model, settings)
 }
 
@@ -528,6 +528,29 @@ mod tests {
             assert_eq!(matches!(out.means, Means::Generated), is_generated, "{name}");
             assert_eq!(out.formed.is_none(), is_generated, "{name}");
         }
+    }
+
+    /// Where all joints are moved, what acts between branches has nothing to push.
+    #[test]
+    fn ties_of_moved_joints_alone_are_no_obstacle() {
+        let mut text = "format = 1\nname = \"moved\"\ngravity = [1.0, -2.0, -9.0]\n".to_owned();
+        for i in 0..10 {
+            let parent = if i < 2 { "world".to_owned() } else { format!("f{}", i - 2) };
+            text += &format!(
+                "[[frames]]\nname = \"f{i}\"\nparent = \"{parent}\"\ntranslation = [0.1, {}, -0.2]\n\
+                 joint = {{ type = \"revolute\", axis = [0.3, 1.0, -0.2] }}\nbody = {{ mass = 1.0 }}\n\
+                 [[coordinates]]\nname = \"f{i}\"\nkind = \"prescribed\"\n",
+                0.1 * (i % 2) as f64
+            );
+        }
+        text += "[[springs]]\ntype = \"two_point\"\na = { frame = \"f8\" }\nb = { frame = \"f9\" }\nstiffness = 9.0\n";
+        let model = Arc::new(Model::compile(&Scene::from_toml(&text).unwrap()).unwrap());
+        assert!(model.has_ties && model.dimensions.dynamic == 0);
+        let mut plant = Plant::new(Arc::clone(&model), Settings::new(&model)).unwrap();
+        let (mut out, mut next) = (StepDerivative::new(&model), [f64::NAN; 20]);
+        plant.differentiate(&[0.1; 10], &mut out).unwrap();
+        out.push_forward(&[0.0; 20], &[1.0; 10], &mut next);
+        assert_eq!(next[..10], [1.0; 10]);
     }
 
     /// Before a step was differentiated, and after one could not be.
