@@ -1,12 +1,13 @@
 //! `H = Σ_c λ_c D²h_c`, the second derivatives of constraints, as products of vectors: O(n) of them.
 //!
 //! Multipliers pull at points with forces, whose second derivatives are `w_i · t_j` for a joint `i` at or above joint `j`
-//! ([`find_torques`](crate::constraints::closure::Closure)). Distances, paths and couplings have products `s y yᵀ` beside.
+//! ([`find_torques`](crate::constraints::closure::Closure)), and by directions with couples. Distances, paths and
+//! couplings have products `s y yᵀ` beside; planes and orientations, whose two vectors both turn, `s (y zᵀ + z yᵀ)`.
 
 use plantd_math::spatial::Vec3;
 
 use crate::lagrangian::kinematics::Poses;
-use crate::lagrangian::vectors::Separation;
+use crate::lagrangian::vectors::{ProductAt, Separation};
 use crate::model::mechanism::{ConstraintKind, Model, PointPair};
 use crate::model::tree::Tree;
 
@@ -29,34 +30,34 @@ pub(crate) struct Bends {
     n: usize,
     /// Joints above others come before them.
     pub(crate) joints: Vec<Bend>,
-    /// `y`, and each with its `s`.
+    /// `y`, and each with its `s` and the row that is its `z`: itself, or the one beside it.
     rows: Vec<f64>,
     weights: Vec<f64>,
+    partners: Vec<usize>,
     /// How many products there are so far.
     filled: usize,
 }
 
 impl Bends {
-    /// Room for those of a model; `None` where an equation has no such form.
-    pub(crate) fn new(model: &Model) -> Option<Self> {
+    /// Room for those of a model.
+    pub(crate) fn new(model: &Model) -> Self {
         let n = model.dimensions.coordinates();
-        let mut count = 0;
-        for constraint in &model.constraints {
-            count += match &constraint.kind {
-                ConstraintKind::Axis(_) => 0,
-                ConstraintKind::Distance(_) => 3,
-                ConstraintKind::PathLength(path) => 2 * path.segments.len(),
-                ConstraintKind::Coupling(coupling) => coupling.terms.len(),
-                ConstraintKind::Product(_) => return None,
-            };
-        }
-        Some(Self {
+        let counts = model.constraints.iter().map(|constraint| match &constraint.kind {
+            ConstraintKind::Axis(_) => 0,
+            ConstraintKind::Distance(_) => 3,
+            ConstraintKind::PathLength(path) => 2 * path.segments.len(),
+            ConstraintKind::Coupling(coupling) => coupling.terms.len(),
+            ConstraintKind::Product(_) => 4,
+        });
+        let count = counts.sum();
+        Self {
             n,
             joints: vec![Bend::default(); model.closure.joints.len()],
             rows: vec![0.0; n * count],
             weights: vec![0.0; count],
+            partners: vec![0; count],
             filled: 0,
-        })
+        }
     }
 
     /// How many products there are.
@@ -64,9 +65,11 @@ impl Bends {
         self.weights.len()
     }
 
-    /// `y`, each with its `s`.
-    pub(crate) fn products(&self) -> impl ExactSizeIterator<Item = (&[f64], f64)> {
-        self.rows.chunks_exact(self.n).zip(self.weights.iter().copied())
+    /// `y`, `z` and `s` of products `s y zᵀ`; with each of two different vectors comes the transposed one.
+    pub(crate) fn products(&self) -> impl ExactSizeIterator<Item = (&[f64], &[f64], f64)> {
+        let partners = self.partners.iter().map(|row| &self.rows[row * self.n..][..self.n]);
+        let pairs = self.rows.chunks_exact(self.n).zip(partners);
+        pairs.zip(&self.weights).map(|((y, z), weight)| (y, z, *weight))
     }
 
     pub(super) fn begin(&mut self) {
@@ -76,23 +79,34 @@ impl Bends {
     /// Adds a product of how the separation of two points changes along an axis.
     pub(super) fn add_separation(
         &mut self,
-        (tree, poses): (&Tree, &Poses),
-        (points, at): (&PointPair, &Separation),
+        on: (&Tree, &Poses),
+        ends: (&PointPair, &Separation),
         axis: Vec3,
         weight: f64,
     ) {
-        let row = self.begin_row(weight);
-        for (end, point, sign) in [(&points.a, at.a, 1.0), (&points.b, at.b, -1.0)] {
+        let row = self.begin_row(weight, self.filled);
+        add_separation(row, on, ends, axis);
+    }
+
+    /// Adds those of how two vectors change along an axis, both ways.
+    pub(super) fn add_vectors(&mut self, of: &ProductAt<'_, f64>, axis: Vec3, weight: f64) {
+        let ProductAt { product, tree, poses, ref at, u, w } = *of;
+        let first = self.filled;
+        for (vector, value, partner) in [(product.u, u, first + 1), (product.w, w, first)] {
+            let row = self.begin_row(weight, partner);
+            let Some(end) = product.end(vector) else {
+                add_separation(row, (tree, poses), (&product.points, at), axis);
+                continue;
+            };
             for joint in tree.ascend(end.joint) {
-                let by = poses.point_gradient(tree, joint, point);
-                row[tree.joints[joint].coordinate] += sign * axis.dot(by);
+                row[tree.joints[joint].coordinate] += axis.dot(poses.turned(tree, joint, value));
             }
         }
     }
 
     /// Adds to the diagonal.
     pub(super) fn add_own(&mut self, coordinate: usize, value: f64) {
-        self.begin_row(value)[coordinate] = 1.0;
+        self.begin_row(value, self.filled)[coordinate] = 1.0;
     }
 
     /// Takes the product with `x` off `out`. Both may be of dynamic coordinates alone.
@@ -111,9 +125,9 @@ impl Bends {
 
     /// The same with the transposed matrix.
     pub(crate) fn subtract_transposed(&self, sums: &mut Sums<1>, x: &[f64], out: &mut [f64]) {
-        for (row, weight) in self.products() {
-            let along: f64 = row.iter().zip(x).map(|(entry, x)| entry * x).sum();
-            out.iter_mut().zip(row).for_each(|(out, entry)| *out -= weight * along * entry);
+        for (y, z, weight) in self.products() {
+            let along: f64 = y.iter().zip(x).map(|(entry, x)| entry * x).sum();
+            out.iter_mut().zip(z).for_each(|(out, entry)| *out -= weight * along * entry);
         }
         sums.add_up(&self.joints, |i| [x.get(i).copied().unwrap_or_default()]);
         for (i, [product]) in sums.products(&self.joints) {
@@ -123,12 +137,28 @@ impl Bends {
         }
     }
 
-    fn begin_row(&mut self, weight: f64) -> &mut [f64] {
+    fn begin_row(&mut self, weight: f64, partner: usize) -> &mut [f64] {
         let row = &mut self.rows[self.filled * self.n..][..self.n];
         row.fill(0.0);
         self.weights[self.filled] = weight;
+        self.partners[self.filled] = partner;
         self.filled += 1;
         row
+    }
+}
+
+/// Adds how the separation of two points changes along an axis.
+fn add_separation(
+    row: &mut [f64],
+    (tree, poses): (&Tree, &Poses),
+    (points, at): (&PointPair, &Separation),
+    axis: Vec3,
+) {
+    for (end, point, sign) in [(&points.a, at.a, 1.0), (&points.b, at.b, -1.0)] {
+        for joint in tree.ascend(end.joint) {
+            let by = poses.point_gradient(tree, joint, point);
+            row[tree.joints[joint].coordinate] += sign * axis.dot(by);
+        }
     }
 }
 

@@ -10,7 +10,7 @@ use plantd_math::spatial::{Mat3, Vec3, three};
 use crate::constraints::bends::{Bend, Bends};
 use crate::constraints::in_plane::InPlane;
 use crate::lagrangian::kinematics::{Place, Poses};
-use crate::lagrangian::vectors::{Distance, across};
+use crate::lagrangian::vectors::{Distance, ProductAt, across};
 use crate::model::mechanism::{ConstraintKind, Length, Model, PointDistance, PointPair};
 use crate::model::tree::{JointKind, Tree};
 
@@ -238,12 +238,19 @@ impl<S: Scalar> Closure<S> {
     fn pull(&mut self, model: &Model, points: &PointPair, force: Vec3<S>) {
         for (end, force) in [(&points.a, force), (&points.b, -force)] {
             if let Some(pull) = self.pulls.get_mut(end.joint) {
-                pull.is_there = true;
                 pull.force += force;
                 let (point, _) = self.poses.point(&model.closure, end);
-                for (column, force) in pull.product.0.iter_mut().zip(force.0) {
-                    *column += point * force;
-                }
+                self.couple(end.joint, point, force);
+            }
+        }
+    }
+
+    /// Takes a couple on a vector that a joint carries: opposite forces at its ends.
+    fn couple(&mut self, joint: usize, vector: Vec3<S>, force: Vec3<S>) {
+        if let Some(pull) = self.pulls.get_mut(joint) {
+            pull.is_there = true;
+            for (column, force) in pull.product.0.iter_mut().zip(force.0) {
+                *column += vector * force;
             }
         }
     }
@@ -370,8 +377,20 @@ impl Closure {
                         out.add_own(i, lambda * value);
                     });
                 }
-                // There is no room for them: see [`Bends::new`].
-                ConstraintKind::Product(_) => {}
+                ConstraintKind::Product(product) => {
+                    let at = ProductAt::new(product, tree, &self.poses);
+                    for axis in across(at.direction()) {
+                        out.add_vectors(&at, axis, lambda);
+                    }
+                    for (vector, value, force) in
+                        [(product.u, at.u, at.w * lambda), (product.w, at.w, at.u * lambda)]
+                    {
+                        match product.end(vector) {
+                            None => self.pull(model, &product.points, force),
+                            Some(end) => self.couple(end.joint, value, force),
+                        }
+                    }
+                }
             }
             c += constraint.count();
         }
@@ -528,7 +547,7 @@ mod tests {
     fn second_derivatives_are_products_of_vectors() {
         let mut tested = 0;
         for model in models().iter().filter(|model| !model.constraints.is_empty()) {
-            let Some(mut bends) = Bends::new(model) else { continue };
+            let mut bends = Bends::new(model);
             let (d, n) = (model.dimensions, model.dimensions.coordinates());
             let multipliers: Vec<f64> =
                 (0..d.constraints).map(|c| (1.3 * c as f64 + 0.5).cos()).collect();
@@ -536,9 +555,9 @@ mod tests {
                 let (q, _) = samples::configuration(model, sample);
                 closure(model, &q).bend(model, &q.q, &multipliers, &mut bends);
                 let mut found = vec![0.0; n * n];
-                for (row, weight) in bends.products() {
+                for (y, z, weight) in bends.products() {
                     for (i, j) in (0..n * n).map(|k| (k / n, k % n)) {
-                        found[i * n + j] += weight * row[i] * row[j];
+                        found[i * n + j] += weight * y[i] * z[j];
                     }
                 }
                 let carries = |above: usize, mut joint: usize| {

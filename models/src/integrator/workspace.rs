@@ -110,7 +110,7 @@ impl ConstraintPair {
 #[derive(Clone, Debug)]
 pub(crate) struct Tangents {
     pub(crate) diagonals: Diagonals,
-    /// `Σ λ D²h`; without room until it is needed, where it bends.
+    /// `Σ λ D²h`; without room until it is needed, where generators stand for it.
     pub(crate) constraint_hessian: Vec<f64>,
     /// `½h L_qq + L_qv`; without room until they are needed, where generators stand for them.
     pub(crate) end_slopes: Vec<f64>,
@@ -120,7 +120,7 @@ pub(crate) struct Tangents {
     pub(crate) balls: Vec<OfBall>,
     /// For linearizations by generators, with constraints.
     pub(crate) pushes: Pushes,
-    /// `Σ λ D²h` where it bends.
+    /// `Σ λ D²h` there.
     pub(crate) bending: Option<Box<Bending>>,
     /// For linearizations by generators, with ties.
     pub(crate) tied: Option<Box<TiedTangents>>,
@@ -131,27 +131,20 @@ impl Tangents {
     /// Makes room for a linearization entry by entry.
     pub(crate) fn make_room(&mut self, model: &Model) {
         let (nd, joints) = (model.dimensions.dynamic, model.dynamics.joints.len());
-        self.make_room_for_hessian(model);
+        let (n, nc) = (model.dimensions.coordinates(), model.dimensions.constraints);
+        self.constraint_hessian.resize(if nc > 0 { n * n } else { 0 }, 0.0);
         self.end_slopes.resize(nd * nd, 0.0);
         if !model.orientations.is_empty() {
             self.flanks.resize(joints, Flanks::default());
         }
     }
 
-    fn make_room_for_hessian(&mut self, model: &Model) {
-        let (n, nc) = (model.dimensions.coordinates(), model.dimensions.constraints);
-        self.constraint_hessian.resize(if nc > 0 { n * n } else { 0 }, 0.0);
-    }
-
     /// Makes room for what a linearization by generators needs beside them, with rows that are so long.
     pub(crate) fn make_room_beside_generators(&mut self, model: &Model, stride: usize) {
-        if model.dimensions.constraints > 0 {
-            self.bending = Bending::new(model, stride).map(Box::new);
-            let (nc, has_hessian) = (model.dimensions.constraints, self.bending.is_none());
-            self.pushes = Pushes::new(model, stride, nc, has_hessian);
-            if has_hessian {
-                self.make_room_for_hessian(model);
-            }
+        let nc = model.dimensions.constraints;
+        if nc > 0 {
+            self.bending = Some(Box::new(Bending::new(model, stride)));
+            self.pushes = Pushes::new(model, stride, nc);
         }
         if model.has_ties {
             self.tied = Some(Box::new(TiedTangents::new(model, stride)));

@@ -10,47 +10,32 @@ use crate::constraints::bends::{Bends, Sums};
 use crate::constraints::closure::Closure;
 use crate::model::mechanism::Model;
 
-/// `H q' + A0ᵀ λ'`, and what it takes off a linearization; `λ'` are derivatives of multipliers, or of the forces of ties.
+/// `A0ᵀ λ'`, and what it takes off a linearization; `λ'` are derivatives of multipliers, or of the forces of ties.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Pushes {
     /// Where the columns of the momentum begin, and how long a row of the linearization is.
     momentum: usize,
     stride: usize,
-    /// `H` and `A0ᵀ`, row-major, nd rows.
-    by_start: Vec<f64>,
+    /// `A0ᵀ`, row-major, nd rows.
     by_multiplier: Vec<f64>,
     /// `−P_p A0ᵀ`, like `A0ᵀ`.
     to_momentum: Vec<f64>,
-    /// Lengths of rows.
-    starts: usize,
+    /// How long these rows are.
     multipliers: usize,
 }
 
 impl Pushes {
-    /// Room for so many multipliers, with rows of a linearization that are so long. `H` has room where it does not
-    /// [bend](Bending).
-    pub(crate) fn new(model: &Model, stride: usize, multipliers: usize, has_hessian: bool) -> Self {
+    /// Room for so many multipliers, with rows of a linearization that are so long.
+    pub(crate) fn new(model: &Model, stride: usize, multipliers: usize) -> Self {
         let d = model.dimensions;
-        let starts = if has_hessian { d.coordinates() } else { 0 };
-        let [starts, multipliers] = [starts, multipliers].map(padded);
-        let zeros = |width: usize| vec![0.0; d.dynamic * width];
+        let multipliers = padded(multipliers);
+        let zeros = || vec![0.0; d.dynamic * multipliers];
         Self {
             momentum: d.coordinates(),
             stride,
-            by_start: zeros(starts),
-            by_multiplier: zeros(multipliers),
-            to_momentum: zeros(multipliers),
-            starts,
+            by_multiplier: zeros(),
+            to_momentum: zeros(),
             multipliers,
-        }
-    }
-
-    /// Takes `H`, row-major.
-    pub(crate) fn take_hessian(&mut self, model: &Model, hessian: &[f64]) {
-        let n = model.dimensions.coordinates();
-        let rows = self.by_start.chunks_exact_mut(self.starts.max(1));
-        for (row, hessian) in rows.zip(hessian.chunks_exact(n)) {
-            row[..n].copy_from_slice(hessian);
         }
     }
 
@@ -68,23 +53,22 @@ impl Pushes {
         rows.zip(entries).for_each(|(row, entry)| row[column] = entry);
     }
 
-    /// Takes `X_p H` off rows `X`, and writes `−X_p A0ᵀ`.
-    pub(crate) fn respond(&self, rows: &mut [f64], responses: &mut [f64], terms: &mut Vec<Term>) {
-        let Self { momentum, by_start, by_multiplier, starts, multipliers, .. } = self;
+    /// Of rows `X`, writes `−X_p A0ᵀ`.
+    pub(crate) fn respond(&self, rows: &[f64], responses: &mut [f64], terms: &mut Vec<Term>) {
+        let Self { momentum, by_multiplier, multipliers, .. } = self;
         let responses = responses.chunks_exact_mut(*multipliers);
         let count = responses.len();
-        for (row, response) in rows.chunks_exact_mut(self.stride).zip(responses) {
+        for (row, response) in rows.chunks_exact(self.stride).zip(responses) {
             terms.clear();
             let by_momentum = row[*momentum..][..count].iter();
             terms.extend(non_zero(by_momentum.map(|entry| -entry)));
-            add_rows(&mut row[..*starts], by_start, *starts, terms);
             response.fill(0.0);
             add_rows(response, by_multiplier, *multipliers, terms);
         }
     }
 
     /// The same of the rows of the momentum, and remembers the responses.
-    pub(crate) fn respond_in_momentum(&mut self, rows: &mut [f64], terms: &mut Vec<Term>) {
+    pub(crate) fn respond_in_momentum(&mut self, rows: &[f64], terms: &mut Vec<Term>) {
         let mut responses = std::mem::take(&mut self.to_momentum);
         self.respond(rows, &mut responses, terms);
         self.to_momentum = responses;
@@ -129,7 +113,7 @@ pub(crate) struct Bending {
     n: usize,
     nd: usize,
     stride: usize,
-    /// For products `s y yᵀ`: `y`, `−X_p y`, and `s yᵀ`.
+    /// For products `s y zᵀ`: `y`, `−X_p y`, and `s zᵀ`.
     pushes: Pushes,
     responses: Vec<f64>,
     weighted: AlignedRows,
@@ -138,29 +122,29 @@ pub(crate) struct Bending {
 }
 
 impl Bending {
-    /// Room for a model, with rows of its linearization that are so long; `None` where `H` has no such form.
-    pub(crate) fn new(model: &Model, stride: usize) -> Option<Self> {
-        let bends = Bends::new(model)?;
+    /// Room for a model, with rows of its linearization that are so long.
+    pub(crate) fn new(model: &Model, stride: usize) -> Self {
+        let bends = Bends::new(model);
         let (nd, count, joints) =
             (model.dimensions.dynamic, bends.count(), model.closure.joints.len());
-        Some(Self {
+        Self {
             n: model.dimensions.coordinates(),
             nd,
             stride,
-            pushes: Pushes::new(model, stride, count, false),
+            pushes: Pushes::new(model, stride, count),
             responses: vec![0.0; nd * padded(count)],
             weighted: AlignedRows::zeros(count * stride),
             sums: Sums::new(joints),
             bends,
-        })
+        }
     }
 
     /// Takes the products that have been found.
     pub(crate) fn take(&mut self) {
-        for (k, (row, weight)) in self.bends.products().enumerate() {
-            self.pushes.take_column(k, row[..self.nd].iter().copied());
+        for (k, (y, z, weight)) in self.bends.products().enumerate() {
+            self.pushes.take_column(k, y[..self.nd].iter().copied());
             let weighted = self.weighted[k * self.stride..][..self.n].iter_mut();
-            weighted.zip(row).for_each(|(to, entry)| *to = weight * entry);
+            weighted.zip(z).for_each(|(to, entry)| *to = weight * entry);
         }
     }
 

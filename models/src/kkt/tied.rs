@@ -57,7 +57,7 @@ impl TiedTangents {
     pub(crate) fn new(model: &Model, stride: usize) -> Self {
         let (nd, count) = (model.dimensions.dynamic, model.tied_rows());
         Self {
-            pushes: Pushes::new(model, stride, count, false),
+            pushes: Pushes::new(model, stride, count),
             increments: vec![0.0; nd * padded(count)],
             changes: vec![0.0; padded(count)],
             forces: AlignedRows::zeros(count * stride),

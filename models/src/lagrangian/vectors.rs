@@ -188,10 +188,12 @@ pub(crate) fn across(along: Vec3) -> [Vec3; 2] {
     } else {
         Vec3([0.0, 0.0, 1.0])
     };
-    let first = along.cross(least);
-    let length = first.norm();
-    let first = if length > 0.0 { first * (1.0 / length) } else { Vec3::ZERO };
-    [first, along.cross(first)]
+    let unit = |vector: Vec3| {
+        let length = vector.norm();
+        if length > 0.0 { vector * (1.0 / length) } else { Vec3::ZERO }
+    };
+    let first = unit(along.cross(least));
+    [first, unit(along.cross(first))]
 }
 
 impl PointPair {
@@ -264,12 +266,23 @@ impl MovingEnd<'_> {
 ///
 /// Joints that carry both bodies turn both vectors alike, and change nothing.
 pub(crate) struct ProductAt<'a, S: Scalar> {
-    product: &'a Product,
-    tree: &'a Tree,
-    poses: &'a Poses<S>,
-    at: Separation<S>,
-    u: Vec3<S>,
-    w: Vec3<S>,
+    pub(crate) product: &'a Product,
+    pub(crate) tree: &'a Tree,
+    pub(crate) poses: &'a Poses<S>,
+    pub(crate) at: Separation<S>,
+    pub(crate) u: Vec3<S>,
+    pub(crate) w: Vec3<S>,
+}
+
+impl Product {
+    /// Where the body is that carries a direction; of a difference there is none.
+    pub(crate) fn end(&self, vector: Vector) -> Option<&Attachment> {
+        match vector {
+            Vector::Difference => None,
+            Vector::WithA(_) => Some(&self.points.a),
+            Vector::WithB(_) => Some(&self.points.b),
+        }
+    }
 }
 
 impl<'a, S: Scalar> ProductAt<'a, S> {
@@ -291,6 +304,14 @@ impl<'a, S: Scalar> ProductAt<'a, S> {
 
     pub(crate) fn value(&self) -> S {
         self.u.dot(self.w)
+    }
+
+    /// That of its vectors which is only turned, or one of them: it changes across itself.
+    pub(crate) fn direction(&self) -> Vec3<S> {
+        match self.product.w {
+            Vector::Difference => self.u,
+            _ => self.w,
+        }
     }
 
     /// Magnitude of what was subtracted, for round-off estimates.

@@ -1,6 +1,5 @@
 //! The derivative of a step as a map: products with `A`, `B` and their transposes, without the matrices.
 
-use plantd_math::rows::dot;
 use plantd_math::sparse_map::Map;
 use plantd_math::spatial::three;
 
@@ -25,10 +24,9 @@ use crate::model::mechanism::Model;
 /// Of one step of the midpoint rule of a tree it takes O(n) to find and to apply, and O(n) of memory, where `A` and
 /// `B` take O(n²). Each of `m` equations of constraints, and of rows of what acts between two bodies of which none is
 /// above the other, along paths over several bodies and on sums of coordinates, takes another O(n) to apply and
-/// O(n m) to find, up to one for two dynamic coordinates. Springs, drag and forces at points and frames are taken with equal halves
-/// ([`ForceSplit::Symmetric`](crate::ForceSplit)) alone; points on planes and orientations that are held, whose
-/// second derivatives are filled, in O(n²). All else, lengths that are prescribed and armatures of sums among it, is by
-/// the matrices, to the same numbers. The memory is made by the first
+/// O(n m) to find, up to one for two dynamic coordinates. Springs, drag and forces at points and frames are taken with
+/// equal halves ([`ForceSplit::Symmetric`](crate::ForceSplit)) alone. All else, lengths that are prescribed and
+/// armatures of sums among it, is by the matrices, to the same numbers. The memory is made by the first
 /// [`Plant::differentiate`](crate::Plant::differentiate).
 ///
 /// ```
@@ -83,8 +81,8 @@ enum Means {
 #[derive(Debug)]
 struct Generated {
     tree: ClosedTree,
-    /// How constraints turn with the start configuration.
-    bent: Bent,
+    /// How constraints turn with the start configuration, where there are some.
+    bent: Option<Bent>,
     /// What acts on and between bodies, where steps have not that.
     fields: Option<Box<Fields>>,
     tied: Option<Box<Tied>>,
@@ -101,14 +99,9 @@ struct ClosedTree {
 
 /// `H = Σ λ D²h`, by the coordinates at the start.
 #[derive(Debug)]
-enum Bent {
-    Nothing,
-    Products {
-        bends: Bends,
-        sums: Sums<1>,
-    },
-    /// Row-major.
-    Filled(Vec<f64>),
+struct Bent {
+    bends: Bends,
+    sums: Sums<1>,
 }
 
 /// By matrices.
@@ -176,38 +169,7 @@ impl ClosedTree {
 
 impl Bent {
     fn new(model: &Model) -> Self {
-        let n = model.dimensions.coordinates();
-        match Bends::new(model) {
-            _ if model.dimensions.constraints == 0 => Self::Nothing,
-            Some(bends) => Self::Products { sums: Sums::new(model.closure.joints.len()), bends },
-            None => Self::Filled(vec![0.0; n * n]),
-        }
-    }
-
-    /// Takes what it gives to the momentum off `p`, by the start configuration.
-    fn push_forward(&mut self, q: &[f64], p: &mut [f64]) {
-        match self {
-            Self::Nothing => {}
-            Self::Products { bends, sums } => bends.subtract_product(sums, q, p),
-            Self::Filled(rows) => {
-                for (p, row) in p.iter_mut().zip(rows.chunks_exact(q.len())) {
-                    *p -= dot(row, q);
-                }
-            }
-        }
-    }
-
-    /// The transpose: takes off `q`, by what the momentum weighs.
-    fn pull_back(&mut self, p: &[f64], q: &mut [f64]) {
-        match self {
-            Self::Nothing => {}
-            Self::Products { bends, sums } => bends.subtract_transposed(sums, p, q),
-            Self::Filled(rows) => {
-                for (p, row) in p.iter().zip(rows.chunks_exact(q.len())) {
-                    q.iter_mut().zip(row).for_each(|(q, entry)| *q -= p * entry);
-                }
-            }
-        }
+        Self { bends: Bends::new(model), sums: Sums::new(model.closure.joints.len()) }
     }
 }
 
@@ -295,7 +257,9 @@ impl StepDerivative {
             by[n + impulse.coordinate] += impulse.residual * u[impulse.input];
         }
         let (start, pushes) = by.split_at_mut(n);
-        bent.push_forward(start, &mut pushes[..nd]);
+        if let Some(Bent { bends, sums }) = bent {
+            bends.subtract_product(sums, start, &mut pushes[..nd]);
+        }
         tree.push_forward(by, increment, momentum);
         let rate = 1.0 / ends.time_step_s;
         let (q, p) = next.split_at_mut(n);
@@ -357,7 +321,9 @@ impl StepDerivative {
         }
         tree.pull_back(x, momentum, by);
         let (start, pushes) = by.split_at_mut(n);
-        bent.pull_back(&pushes[..nd], start);
+        if let Some(Bent { bends, sums }) = bent {
+            bends.subtract_transposed(sums, &pushes[..nd], start);
+        }
         by_x[..n + nd].copy_from_slice(&by[..n + nd]);
         by_u[ni..].copy_from_slice(&by[n + nd..]);
         by_x[..nd].iter_mut().zip(q).for_each(|(by, q)| *by += q);
@@ -402,10 +368,11 @@ impl Workspace {
         let KktSystem { fields, tied, .. } = &self.kkt;
         let has_fields = fields.is_some() || !model.has_fields();
         let has_ties = tied.is_some() || !model.has_ties;
+        let has_constraints = model.dimensions.constraints > 0;
         let generated = &mut **generated.get_or_insert_with(|| {
             Box::new(Generated {
                 tree: ClosedTree::new(model),
-                bent: Bent::new(model),
+                bent: has_constraints.then(|| Bent::new(model)),
                 fields: (!has_fields).then(|| Box::new(Fields::new(model))),
                 tied: (!has_ties).then(|| Box::new(Tied::new(model, 1))),
             })
@@ -461,18 +428,12 @@ impl Workspace {
         } else {
             result?;
         }
-        if model.dimensions.constraints == 0 {
-            return Ok(true);
-        }
+        let Some(bent) = bent else { return Ok(true) };
         self.prepare_start(model, state);
         self.finish_end(model, state);
         let Self { constraints, kkt, step, .. } = self;
-        let (start, multipliers) = (&mut constraints.start, &step.multipliers);
-        match bent {
-            Bent::Nothing => {}
-            Bent::Products { bends, .. } => start.bend(model, &state.q, multipliers, bends),
-            Bent::Filled(rows) => start.hessian(model, &state.q, multipliers, rows),
-        }
+        let start = &mut constraints.start;
+        start.bend(model, &state.q, &step.multipliers, &mut bent.bends);
         let (closing, respond) = tree.close_next(by);
         kkt.schur.respond(model, start, closing.take_responses(respond));
         let is_regular = kkt.close_schur(model, &constraints.end, time_step_s, singular_below);

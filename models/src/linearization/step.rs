@@ -159,26 +159,23 @@ impl Workspace {
     /// x' − X_p (H q' + A0ᵀ λ')      p[k+1]' − P_p (H q' + A0ᵀ λ')      S = −A1 X_p A0ᵀ
     /// ```
     ///
-    /// in O(n² nc); where the second derivatives `H` of the constraints are no products of vectors, in O(n³).
+    /// in O(n² nc), with the second derivatives `H` of the constraints as products of vectors.
     fn constrain(&mut self, at: StepContext<'_>, out: &mut Linearization) -> Result<(), StepError> {
         let StepContext { model, settings, state, .. } = at;
         let Settings { time_step_s, singular_below, .. } = *settings;
         self.prepare_start(model, state);
         self.finish_end(model, state);
         let Self { constraints, kkt, tangents, step, .. } = self;
-        let Tangents { constraint_hessian: hessian, pushes, bending, terms, .. } = tangents;
+        let Tangents { pushes, bending, terms, .. } = tangents;
         if let Some(bending) = bending {
             constraints.start.bend(model, &state.q, &step.multipliers, &mut bending.bends);
             bending.take();
             bending.take_off(&mut out.increment, terms);
             bending.take_off(&mut out.momentum, terms);
-        } else {
-            constraints.start.hessian(model, &state.q, &step.multipliers, hessian);
-            pushes.take_hessian(model, hessian);
         }
         pushes.take_jacobian(model, &constraints.start);
-        pushes.respond(&mut out.increment, &mut kkt.schur.responses, terms);
-        pushes.respond_in_momentum(&mut out.momentum, terms);
+        pushes.respond(&out.increment, &mut kkt.schur.responses, terms);
+        pushes.respond_in_momentum(&out.momentum, terms);
         let is_regular = kkt.close_schur(model, &constraints.end, time_step_s, singular_below);
         self.check_schur(model, is_regular)?;
         self.solve_multipliers(at, out);

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use nalgebra::{DMatrix, DVector, Rotation3, Vector3};
+use nalgebra::{DMatrix, DVector, Rotation3, UnitQuaternion, Vector3};
 use plantd_math::rows::{padded, spread};
 use plantd_math::simd::{AVX2, AVX512, PORTABLE, within};
 use plantd_math::tree_lu::TreeLu;
@@ -714,10 +714,11 @@ fn what_acts_between_branches_is_tied() {
 enum Joined {
     AtPoint,
     InPlane,
+    Welded,
 }
 
 /// A scene with equations that its initial configuration satisfies: a point of a body is joined to another one, two are
-/// a distance apart, and a cable runs over three. Some coordinates are moved, and all is by the tree or by generators.
+/// a distance apart, or a cable runs over three. Some coordinates are moved, and all is by the tree or by generators.
 fn closed(model: Model, joined: Joined, frames: [&str; 4], more: &str, moved: &[&str]) -> Model {
     let mut scene = model.scene().clone();
     prescribe(&mut scene, moved);
@@ -730,8 +731,10 @@ fn closed(model: Model, joined: Joined, frames: [&str; 4], more: &str, moved: &[
     let [a, b, c, d] = frames;
     let ends = [(a, [0.0, 0.0, -0.05]), (c, [0.1, 0.0, 0.0]), (d, [0.0, 0.2, 0.1])];
     let [first, second, third] = ends.map(|(frame, at)| place(frame, at).0);
-    let (base, turned) = place(b, [0.0; 3]);
+    let ((base, turned), (_, turned_first)) = (place(b, [0.0; 3]), place(a, [0.0; 3]));
     let there: [f64; 3] = (turned.inverse() * (first - base)).into();
+    let relative = UnitQuaternion::from_rotation_matrix(&(turned.inverse() * turned_first));
+    let [x, y, z] = relative.imag().into();
     let [p, q, r] = ends.map(|(frame, at)| format!("{{ frame = \"{frame}\", at = {at:?} }}"));
     let join = match joined {
         Joined::AtPoint => format!(
@@ -742,13 +745,20 @@ fn closed(model: Model, joined: Joined, frames: [&str; 4], more: &str, moved: &[
             "type = \"point_on_plane\"\npoint = {p}\n\
              plane = {{ frame = \"{b}\", at = {there:?}, normal = [0.3, -0.5, 0.8] }}"
         ),
+        Joined::Welded => format!(
+            "type = \"weld\"\na = \"plate\"\nb = \"seat\"\n\
+             [[frames]]\nname = \"plate\"\nparent = \"{a}\"\ntranslation = [0.0, 0.0, -0.05]\n\
+             [[frames]]\nname = \"seat\"\nparent = \"{b}\"\ntranslation = {there:?}\n\
+             rotation = {{ quaternion = [{:?}, {x:?}, {y:?}, {z:?}] }}",
+            relative.w
+        ),
     };
     let (rod, cable) = ((second - third).norm(), (first - second).norm() + (second - third).norm());
     let equations = match joined {
         Joined::AtPoint => format!(
             "[[constraints]]\nname = \"rod\"\ntype = \"distance\"\nlength = {rod:?}\na = {q}\nb = {r}\n"
         ),
-        Joined::InPlane => format!(
+        Joined::InPlane | Joined::Welded => format!(
             "[[constraints]]\nname = \"cable\"\ntype = \"path_length\"\nlength = {cable:?}\npoints = [{p}, {q}, {r}]\n"
         ),
     };
@@ -776,12 +786,15 @@ fn constraints_are_closed_by_generators() {
     let rope = closed(compiled(&bent), Joined::AtPoint, ["f31", "world", "f20", "f4"], "", &[]);
     assert_eq!(rope.solver, Solver::Spatial);
     let sprung = fields(["f23", "f10"]);
-    let (at_point, in_plane) = (Joined::AtPoint, Joined::InPlane);
+    let (at_point, in_plane, welded) = (Joined::AtPoint, Joined::InPlane, Joined::Welded);
     for model in [
         rope,
         closed(branches("damping = 0.3"), at_point, ["f21", "f22", "f17", "world"], "", &[]),
         closed(branches(""), at_point, ["f21", "world", "f17", "f12"], &sprung, &["f2", "f9"]),
         closed(branches(""), in_plane, ["f21", "f12", "f17", "f22"], &sprung, &["f2", "f9"]),
+        closed(branches(""), welded, ["f21", "f12", "f17", "f22"], &sprung, &["f2"]),
+        closed(compiled(&bent), welded, ["f31", "world", "f20", "f4"], "", &["f3"]),
+        closed(floating(), welded, ["f8", "f7", "f6", "world"], "", &[]),
         closed(floating(), at_point, ["f8", "f7", "f6", "world"], "", &[]),
         closed(floating(), in_plane, ["f8", "f7", "f6", "world"], "", &[]),
         closed(floating(), at_point, ["f6", "world", "f8", "f7"], "", &ball),
