@@ -11,7 +11,9 @@ use crate::constraints::bends::{Bend, Bends};
 use crate::constraints::in_plane::InPlane;
 use crate::lagrangian::kinematics::{Place, Poses};
 use crate::lagrangian::vectors::{Distance, ProductAt, across};
-use crate::model::mechanism::{ConstraintKind, Length, Model, PointDistance, PointPair};
+use crate::model::mechanism::{
+    ConstraintKind, Length, Model, PathJoint, PointDistance, PointPair, Product,
+};
 use crate::model::tree::{JointKind, Tree};
 
 /// A configuration may violate a constraint by this fraction of the lengths involved.
@@ -43,8 +45,9 @@ pub(crate) struct Closure<S: Scalar = f64> {
     /// What pulls at each joint, for second derivatives, and what they are made of.
     pulls: Vec<Pull<S>>,
     torques: Vec<Vec3<S>>,
-    /// Of a distance, by the coordinates on the path between its ends.
+    /// Of a distance, and of the vectors of a product, by the coordinates on the path between the ends.
     gradients: Vec<(usize, Vec3<S>)>,
+    vectors: Vec<(usize, [Vec3<S>; 2])>,
     /// What is at the configuration of the last [`Closure::evaluate`].
     pub(crate) known: Known,
     /// Parts of the Jacobian as they were before they were turned, and where.
@@ -74,6 +77,24 @@ fn moved<S: Scalar>(row: &[S], q: &[S]) -> S::Magnitude {
 #[inline(always)]
 pub(crate) fn in_units(h: f64, round_off: f64) -> f64 {
     if h == 0.0 { 0.0 } else { h.abs() / round_off }
+}
+
+/// Adds what belongs to two coordinates, both ways, by what belongs to each.
+#[inline(always)]
+fn add_pairs<S: Scalar, G: Copy>(
+    gradients: &[(usize, G)],
+    n: usize,
+    out: &mut [S],
+    value: impl Fn(G, G) -> S,
+) {
+    for (k, &(i, row)) in gradients.iter().enumerate() {
+        for &(j, column) in &gradients[..k] {
+            let value = value(row, column);
+            out[i * n + j] += value;
+            out[j * n + i] += value;
+        }
+        out[i * n + i] += value(row, row);
+    }
 }
 
 /// Multipliers of equations along world axes as forces `f` at the points `p` that a joint carries.
@@ -131,6 +152,7 @@ impl<S: Scalar> Closure<S> {
             pulls: vec![Pull::NONE; model.closure.joints.len()],
             torques: vec![Vec3::ZERO; model.closure.joints.len()],
             gradients: Vec::with_capacity(model.closure.joints.len()),
+            vectors: Vec::with_capacity(model.closure.joints.len()),
             known: Known::Nothing,
             unturned: Vec::with_capacity(nc * model.orientations.len()),
             in_plane: model.loops.as_ref().map(|loops| Box::new(InPlane::new(loops))),
@@ -220,6 +242,10 @@ impl<S: Scalar> Closure<S> {
                     }
                     are_pulled = true;
                 }
+                ConstraintKind::Product(product) if product.points.are_apart(&model.closure) => {
+                    self.add_mixed(model, product, lambda, out);
+                    are_pulled = true;
+                }
                 _ => {
                     let at = Place { tree: &model.closure, poses: &self.poses, q };
                     constraint.for_each_second_derivative(at, &mut |i, j, value| {
@@ -266,19 +292,36 @@ impl<S: Scalar> Closure<S> {
         let (n, tree) = (model.dimensions.coordinates(), &model.closure);
         let at = points.separation(tree, &self.poses);
         self.gradients.clear();
-        for joint in &points.path {
-            let i = joint.coordinate;
-            let gradient = joint.gradient(tree, &self.poses, &at);
-            let scaled = gradient * factor;
-            for &(j, other) in &self.gradients {
-                let value = scaled.dot(other);
-                out[i * n + j] += value;
-                out[j * n + i] += value;
-            }
-            out[i * n + i] += scaled.dot(gradient);
-            self.gradients.push((i, gradient));
-        }
+        let gradient = |joint: &PathJoint| joint.gradient(tree, &self.poses, &at);
+        let gradients = points.path.iter().map(|joint| (joint.coordinate, gradient(joint)));
+        self.gradients.extend(gradients);
+        add_pairs(&self.gradients, n, out, |row, column| (row * factor).dot(column));
         at.difference * factor
+    }
+
+    /// Adds `u_i·w_j + u_j·w_i`, times a factor, by the coordinates between two vectors, and pulls at them with each
+    /// other.
+    fn add_mixed(&mut self, model: &Model, product: &Product, factor: S, out: &mut [S]) {
+        let (n, tree) = (model.dimensions.coordinates(), &model.closure);
+        let at = ProductAt::new(product, tree, &self.poses);
+        self.vectors.clear();
+        let path = product.points.path.iter();
+        self.vectors.extend(path.map(|joint| (joint.coordinate, at.gradients(joint))));
+        add_pairs(&self.vectors, n, out, |[row_u, row_w], [u, w]| {
+            (row_u * factor).dot(w) + (row_w * factor).dot(u)
+        });
+        let vectors = [at.u, at.w];
+        self.pull_vectors(model, product, vectors, factor);
+    }
+
+    /// Pulls at each vector of a product with the other one, times a factor.
+    fn pull_vectors(&mut self, model: &Model, product: &Product, [u, w]: [Vec3<S>; 2], factor: S) {
+        for (vector, value, force) in [(product.u, u, w * factor), (product.w, w, u * factor)] {
+            match product.end(vector) {
+                None => self.pull(model, &product.points, force),
+                Some(end) => self.couple(end.joint, value, force),
+            }
+        }
     }
 
     /// Sums up what pulls at each joint and below it, and finds for each joint `j` what the second derivatives of `Σ f·p`
@@ -382,14 +425,8 @@ impl Closure {
                     for axis in across(at.direction()) {
                         out.add_vectors(&at, axis, lambda);
                     }
-                    for (vector, value, force) in
-                        [(product.u, at.u, at.w * lambda), (product.w, at.w, at.u * lambda)]
-                    {
-                        match product.end(vector) {
-                            None => self.pull(model, &product.points, force),
-                            Some(end) => self.couple(end.joint, value, force),
-                        }
-                    }
+                    let vectors = [at.u, at.w];
+                    self.pull_vectors(model, product, vectors, lambda);
                 }
             }
             c += constraint.count();

@@ -112,6 +112,8 @@ struct Fork {
 /// The Newton matrix of a tree in space, factored. Vectors have `B` blocks ([`Model::blocks`]).
 #[derive(Clone, Debug)]
 pub(crate) struct SpatialRecursion<const B: usize> {
+    /// How many coordinates there are: as many as joints, or more.
+    coordinates: usize,
     /// In the order of their elimination, as are groups.
     limbs: Vec<Limb>,
     groups: Vec<Group>,
@@ -394,6 +396,7 @@ impl<const B: usize> SpatialRecursion<B> {
         let (limbs, groups, places) = limbs(&model.dynamics, model.dimensions.dynamic, acting);
         Self {
             within: vec![[[0.0; WIDEST]; WIDEST]; groups.len()],
+            coordinates: model.dimensions.coordinates(),
             limbs,
             groups,
             axes: vec![Generators::default(); joints],

@@ -324,7 +324,8 @@ impl<'a, S: Scalar> ProductAt<'a, S> {
     }
 
     /// Derivatives of `u` and `w` by the coordinate of a joint on the path.
-    fn gradients(&self, joint: &PathJoint) -> [Vec3<S>; 2] {
+    #[inline(always)]
+    pub(crate) fn gradients(&self, joint: &PathJoint) -> [Vec3<S>; 2] {
         [(self.product.u, self.u), (self.product.w, self.w)].map(|(vector, value)| {
             match (vector, joint.carries) {
                 (Vector::Difference, _) => joint.gradient(self.tree, self.poses, &self.at),

@@ -476,7 +476,7 @@ mod tests {
             (builtin("chain-8"), 4, false),
             (geared, 2, true),
             (builtin("four-bar"), 2, false),
-            (builtin("marionette"), 2, false),
+            (builtin("marionette"), 2, true),
         ] {
             let model = Arc::new(model);
             let name = &model.scene.name;

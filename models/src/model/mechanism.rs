@@ -784,12 +784,12 @@ impl Model {
         self.potentials.couple_branches || self.forces.is_some()
     }
 
-    /// Whether each coordinate has a joint, the dynamic ones in their order.
+    /// Whether each dynamic coordinate has a joint that moves bodies, in their order. Prescribed ones may have none:
+    /// lengths, and joints that carry nothing but points.
     fn joints_are_in_order(&self) -> bool {
-        let (d, joints) = (self.dimensions, &self.dynamics.joints);
-        let coordinates = joints.iter().map(|joint| joint.coordinate);
-        let dynamic = coordinates.filter(|i| *i < d.dynamic);
-        dynamic.eq(0..d.dynamic) && joints.len() == d.coordinates()
+        let coordinates = self.dynamics.joints.iter().map(|joint| joint.coordinate);
+        let nd = self.dimensions.dynamic;
+        coordinates.filter(|i| *i < nd).eq(0..nd)
     }
 
     /// The scene it was compiled from.

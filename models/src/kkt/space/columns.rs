@@ -170,7 +170,7 @@ impl<const B: usize> Columns<B> {
         margins: &Margins<B>,
         first: usize,
     ) {
-        let window = Window::new(first, E::COUNT, recursion.axes.len());
+        let window = Window::new(first, E::COUNT, recursion.coordinates);
         for (at, limb) in recursion.limbs.iter().enumerate() {
             let mut groups = limb.groups.clone();
             let is_reached = |at: &usize| window.is_below(&recursion.groups[*at]);
@@ -197,8 +197,7 @@ impl<const B: usize> Columns<B> {
         margins: &Margins<B>,
         first: usize,
     ) {
-        let SpatialRecursion { groups, axes, within, .. } = recursion;
-        let n = axes.len();
+        let SpatialRecursion { coordinates: n, groups, axes, within, .. } = recursion;
         let Limb { carries, hangs_from, .. } = limb;
         let mut flow = const { [[E::ZERO; 8]; U] };
         if let Some(place) = *carries {
@@ -276,8 +275,7 @@ impl<const B: usize> Columns<B> {
         first: usize,
         rows: &mut Rows<'_>,
     ) {
-        let SpatialRecursion { groups, axes, .. } = recursion;
-        let n = axes.len();
+        let SpatialRecursion { coordinates: n, groups, axes, .. } = recursion;
         let Limb { groups: own, carries, hangs_from, .. } = limb;
         let mut motion = match hangs_from {
             Some(fork) => of_blocks::<E, B, U>(&self.motions[fork.place]),
@@ -430,7 +428,7 @@ impl<const B: usize> InEights for AllColumns<'_, B> {
     #[inline(always)]
     fn run<E: Eight>(self) {
         let Self { recursion, margins, columns, mut rows } = self;
-        for first in (0..2 * recursion.axes.len()).step_by(E::One::COUNT) {
+        for first in (0..2 * recursion.coordinates).step_by(E::One::COUNT) {
             columns.go_up::<E::One>(recursion, margins, first);
             columns.go_down::<E::One>(recursion, margins, first, &mut rows);
         }

@@ -88,9 +88,9 @@ impl<const B: usize> InEights for PushForward<'_, B> {
     #[inline(always)]
     fn run<E: Eight>(self) {
         let Self { recursion, margins, by, x, momentum } = self;
-        let SpatialRecursion { limbs, groups, axes, within, flows, .. } = recursion;
+        let SpatialRecursion { coordinates, limbs, groups, axes, within, flows, .. } = recursion;
         let (tree, read) = (Limbs { limbs, groups }, Read { axes, within, margins });
-        let (start, next) = by.split_at(axes.len());
+        let (start, next) = by.split_at(*coordinates);
         let (x, momentum) = (&mut *x, &mut *momentum);
         tree.ascend::<E, B>(flows, &mut Forced { read, start, next, x, momentum });
         tree.descend::<E, B>(flows, &mut Moved { read, start, next, x, momentum });
@@ -197,9 +197,10 @@ impl<const B: usize> InEights for PullBack<'_, B> {
     #[inline(always)]
     fn run<E: Eight>(self) {
         let Self { recursion, margins, x, momentum, by } = self;
-        let SpatialRecursion { limbs, groups, axes, within, flows, .. } = recursion;
+        let SpatialRecursion { coordinates, limbs, groups, axes, within, flows, .. } = recursion;
         let (tree, read) = (Limbs { limbs, groups }, Read { axes, within, margins });
-        let (start, next) = by.split_at_mut(axes.len());
+        by.fill(0.0);
+        let (start, next) = by.split_at_mut(*coordinates);
         let (x, start, next) = (&mut *x, &mut *start, &mut *next);
         tree.ascend::<E, B>(flows, &mut WeighedMotion { read, x, momentum, start, next });
         tree.descend::<E, B>(flows, &mut WeighedForce { read, x, momentum, start, next });

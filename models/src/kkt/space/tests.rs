@@ -372,7 +372,7 @@ fn move_alike(model: &Arc<Model>, steps: u32) -> Plant {
     let start: Vec<f64> = fast.q()[d.dynamic..].to_vec();
     for k in 0..steps {
         for (i, start) in start.iter().enumerate() {
-            u[d.inputs + i] = start + 0.1 * (0.05 * f64::from(k + 1) * (1.0 + wave(i))).sin();
+            u[d.inputs + i] = start + 0.02 * (0.05 * f64::from(k + 1) * (1.0 + wave(i))).sin();
         }
         fast.step_and_linearize(&u, &mut linear[0]).unwrap();
         slow.step_and_linearize(&u, &mut linear[1]).unwrap();
@@ -715,6 +715,8 @@ enum Joined {
     AtPoint,
     InPlane,
     Welded,
+    /// To a hook that is moved, and the cable to a reel.
+    Dragged,
 }
 
 /// A scene with equations that its initial configuration satisfies: a point of a body is joined to another one, two are
@@ -745,6 +747,16 @@ fn closed(model: Model, joined: Joined, frames: [&str; 4], more: &str, moved: &[
             "type = \"point_on_plane\"\npoint = {p}\n\
              plane = {{ frame = \"{b}\", at = {there:?}, normal = [0.3, -0.5, 0.8] }}"
         ),
+        Joined::Dragged => format!(
+            "type = \"point_to_point\"\naxes = [\"x\", \"y\", \"z\"]\n\
+             a = {p}\nb = {{ frame = \"hook\" }}\n\
+             [[frames]]\nname = \"slide\"\nparent = \"{b}\"\ntranslation = {there:?}\n\
+             joint = {{ type = \"prismatic\", axis = [0.2, 1.0, 0.0] }}\n\
+             [[frames]]\nname = \"hook\"\nparent = \"slide\"\n\
+             joint = {{ type = \"revolute\", axis = [0.0, 0.3, 1.0] }}\n\
+             [[coordinates]]\nname = \"slide\"\nkind = \"prescribed\"\n\
+             [[coordinates]]\nname = \"hook\"\nkind = \"prescribed\""
+        ),
         Joined::Welded => format!(
             "type = \"weld\"\na = \"plate\"\nb = \"seat\"\n\
              [[frames]]\nname = \"plate\"\nparent = \"{a}\"\ntranslation = [0.0, 0.0, -0.05]\n\
@@ -760,6 +772,10 @@ fn closed(model: Model, joined: Joined, frames: [&str; 4], more: &str, moved: &[
         ),
         Joined::InPlane | Joined::Welded => format!(
             "[[constraints]]\nname = \"cable\"\ntype = \"path_length\"\nlength = {cable:?}\npoints = [{p}, {q}, {r}]\n"
+        ),
+        Joined::Dragged => format!(
+            "[[coordinates]]\nname = \"reel\"\nkind = \"prescribed\"\ninitial = {cable:?}\n\
+             [[constraints]]\nname = \"cable\"\ntype = \"path_length\"\nlength = \"reel\"\npoints = [{p}, {q}, {r}]\n"
         ),
     };
     let text =
@@ -787,6 +803,7 @@ fn constraints_are_closed_by_generators() {
     assert_eq!(rope.solver, Solver::Spatial);
     let sprung = fields(["f23", "f10"]);
     let (at_point, in_plane, welded) = (Joined::AtPoint, Joined::InPlane, Joined::Welded);
+    let dragged = |model, frames, more| closed(model, Joined::Dragged, frames, more, &["f3"]);
     for model in [
         rope,
         closed(branches("damping = 0.3"), at_point, ["f21", "f22", "f17", "world"], "", &[]),
@@ -794,6 +811,9 @@ fn constraints_are_closed_by_generators() {
         closed(branches(""), in_plane, ["f21", "f12", "f17", "f22"], &sprung, &["f2", "f9"]),
         closed(branches(""), welded, ["f21", "f12", "f17", "f22"], &sprung, &["f2"]),
         closed(compiled(&bent), welded, ["f31", "world", "f20", "f4"], "", &["f3"]),
+        dragged(compiled(&bent), ["f31", "world", "f20", "f4"], ""),
+        dragged(branches(""), ["f21", "f12", "f17", "f22"], &sprung),
+        dragged(floating(), ["f8", "f7", "f6", "world"], ""),
         closed(floating(), welded, ["f8", "f7", "f6", "world"], "", &[]),
         closed(floating(), at_point, ["f8", "f7", "f6", "world"], "", &[]),
         closed(floating(), in_plane, ["f8", "f7", "f6", "world"], "", &[]),
