@@ -1,8 +1,8 @@
 //! `H = Σ_c λ_c D²h_c`, the second derivatives of constraints, as products of vectors: O(n) of them.
 //!
-//! Multipliers pull at points with forces, whose second derivatives are `w_i · t_j` for a joint `i` at or above joint `j`
-//! ([`find_torques`](crate::constraints::closure::Closure)), and by directions with couples. Distances, paths and
-//! couplings have products `s y yᵀ` beside; planes and orientations, whose two vectors both turn, `s (y zᵀ + z yᵀ)`.
+//! Multipliers pull at points with forces, and turn directions with couples, whose second derivatives are `w_i · t_j` for a
+//! joint `i` at or above joint `j` ([`find_torques`](crate::constraints::closure::Closure)). Distances, paths and
+//! couplings have products `s y yᵀ` beside; planes and orientations, whose two vectors both move, `s (y zᵀ + z yᵀ)`.
 
 use plantd_math::spatial::Vec3;
 

@@ -1,7 +1,7 @@
 //! Constraints at one end of a step: values, Jacobian and second derivatives.
 //!
-//! The equations are those of [`equations`](crate::constraints::equations). Second derivatives of distances and
-//! of equations along axes are summed up as forces on what joints carry.
+//! The equations are those of [`equations`](crate::constraints::equations). Second derivatives are summed up as
+//! forces at the points, and couples on the directions, that joints carry.
 
 use plantd_math::norms::larger;
 use plantd_math::scalar::{Scalar, in_registers};
@@ -97,7 +97,8 @@ fn add_pairs<S: Scalar, G: Copy>(
     }
 }
 
-/// Multipliers of equations along world axes as forces `f` at the points `p` that a joint carries.
+/// Multipliers as forces `f` at the points `p` that a joint carries. A direction `p` is turned, and not moved: the
+/// products count alone.
 #[derive(Clone, Copy, Debug)]
 struct Pull<S> {
     is_there: bool,
@@ -143,6 +144,8 @@ impl Closure {
 impl<S: Scalar> Closure<S> {
     pub(crate) fn new(model: &Model) -> Self {
         let nc = model.constraints.len();
+        let is_product = |kind: &ConstraintKind| matches!(kind, ConstraintKind::Product(_));
+        let has_vectors = model.constraints.iter().any(|constraint| is_product(&constraint.kind));
         Self {
             poses: Poses::new(&model.closure),
             value: vec![S::ZERO; nc],
@@ -152,7 +155,7 @@ impl<S: Scalar> Closure<S> {
             pulls: vec![Pull::NONE; model.closure.joints.len()],
             torques: vec![Vec3::ZERO; model.closure.joints.len()],
             gradients: Vec::with_capacity(model.closure.joints.len()),
-            vectors: Vec::with_capacity(model.closure.joints.len()),
+            vectors: Vec::with_capacity(if has_vectors { model.closure.joints.len() } else { 0 }),
             known: Known::Nothing,
             unturned: Vec::with_capacity(nc * model.orientations.len()),
             in_plane: model.loops.as_ref().map(|loops| Box::new(InPlane::new(loops))),
