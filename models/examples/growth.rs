@@ -3,8 +3,8 @@
 //! world.
 //!
 //! `cargo run --release -p plantd-models --example growth`; in place of the spring to the world, with `-- braced` springs
-//! all along, each over two of the joints, with `-- tied` an elastic tendon over five rods, and with `-- pinned` a tip
-//! that is held where it is
+//! all along, each over two of the joints, with `-- tied` an elastic tendon over five rods, with `-- pinned` a tip that is
+//! held where it is, with `-- dragged` one that goes with a hook as it is moved, and with `-- welded` one whose rod is held
 
 use std::error::Error;
 use std::hint::black_box;
@@ -66,20 +66,30 @@ fn rope(joints: usize, kind: &str) -> Result<Scene, Box<dyn Error>> {
                 points.join(", ")
             );
         }
-        "pinned" => {
-            text += &format!(
-                "[[constraints]]\nname = \"tip\"\ntype = \"point_to_point\"\naxes = [\"x\", \"y\", \"z\"]\n\
-                 a = {{ frame = \"rod{}\" }}\nb = {{ frame = \"world\", at = [0.1, 0.2, -0.8] }}\n",
-                rods - 1
-            );
+        "pinned" | "dragged" | "welded" => {
+            text +=
+                "[[frames]]\nname = \"hook\"\nparent = \"world\"\ntranslation = [0.1, 0.2, -0.8]\n";
+            if kind == "dragged" {
+                text += "joint = { type = \"prismatic\", axis = [0.0, 1.0, 0.0] }\n\
+                         [[coordinates]]\nname = \"hook\"\nkind = \"prescribed\"\n";
+            }
+            let tip = rods - 1;
+            text += "[[constraints]]\nname = \"tip\"\n";
+            text += &match kind {
+                "welded" => format!("type = \"weld\"\na = \"rod{tip}\"\nb = \"hook\"\n"),
+                _ => format!(
+                    "type = \"point_to_point\"\naxes = [\"x\", \"y\", \"z\"]\n\
+                     a = {{ frame = \"rod{tip}\" }}\nb = {{ frame = \"hook\" }}\n"
+                ),
+            };
         }
         _ => text += &spring(rods - 1, "frame = \"world\", at = [0.0, 0.0, -1.2]"),
     }
     Ok(Scene::from_toml(&text)?)
 }
 
-/// Where the top is at the end of the next step, m.
-fn top(plant: &Plant) -> f64 {
+/// How far the top, and what else is moved, is at the end of the next step, m.
+fn moved(plant: &Plant) -> f64 {
     0.02 * (3.0 * plant.time_s()).sin()
 }
 
@@ -90,12 +100,13 @@ fn shortest_us(
     mut call: impl FnMut(&mut Plant, &[f64]) -> Result<(), StepError>,
 ) -> Result<f64, Box<dyn Error>> {
     let (start, mut best) = (plant.snapshot(), f64::INFINITY);
+    let mut u = vec![0.0; plant.model().dimensions().input()];
     for _ in 0..9 {
         plant.restore(&start)?;
         let begin = cpu_time_s();
         for _ in 0..calls {
-            let top = top(plant);
-            call(plant, &[top])?;
+            u.fill(moved(plant));
+            call(plant, &u)?;
         }
         best = best.min((cpu_time_s() - begin) * 1e6 / f64::from(calls));
     }
@@ -140,14 +151,13 @@ fn main() -> Result<(), Box<dyn Error>> {
             spare.start(&Initial::Scene)?
         } else {
             // A bent rope, whose tip goes where it is held.
-            let bent = |i: usize| if i + 1 < d.coordinates() { 4.0 / joints as f64 } else { 0.0 };
+            let bent = |i: usize| if i < d.dynamic { 4.0 / joints as f64 } else { 0.0 };
             let q = (0..d.coordinates()).map(bent).collect();
             spare.start(&Initial::Projection { q, hold: Vec::new() })?
         };
         // The first steps from rest need more corrections, the more joints there are.
         for _ in 0..100 {
-            let top = top(&plant);
-            plant.step(&[top])?;
+            plant.step(&vec![moved(&plant); d.input()])?;
         }
 
         let count = 16;

@@ -8,7 +8,7 @@
 mod registers;
 
 #[cfg(target_arch = "x86_64")]
-use crate::eights::registers::{Halves, Whole};
+use crate::eights::registers::{Halves, Low, Pairs, Whole};
 use crate::rows::{Block, LANES, sum_of_eight};
 #[cfg(target_arch = "x86_64")]
 use crate::simd::{AVX2, AVX512, has};
@@ -139,7 +139,7 @@ pub fn in_eights<T: InEights>(task: T) -> T::Output {
         }
         #[target_feature(enable = "avx2")]
         fn avx2<T: InEights>(task: T) -> T::Output {
-            task.run::<Halves>()
+            task.run::<Halves<Low>>()
         }
         if has(AVX512) {
             // SAFETY: the processor has AVX-512.
@@ -149,7 +149,9 @@ pub fn in_eights<T: InEights>(task: T) -> T::Output {
             // SAFETY: the processor has AVX2.
             return unsafe { avx2(task) };
         }
+        task.run::<Halves<Pairs>>()
     }
+    #[cfg(not(target_arch = "x86_64"))]
     task.run::<Block>()
 }
 
@@ -315,7 +317,8 @@ mod tests {
         let (a, b) = (block(0.3), block(1.7));
         let all = |registers| within(registers, || in_eights(All([&a, &b])).map(|b| b.0));
         let wide = all(AVX512);
-        assert_eq!([wide, wide], [all(AVX2), all(PORTABLE)]);
+        let by_number = All([&a, &b]).run::<Block>().map(|b| b.0);
+        assert_eq!([wide; 3], [all(AVX2), all(PORTABLE), by_number]);
         for i in 0..8 {
             let [x, y] = [a.0[i], b.0[i]];
             assert_eq!([wide[0][i], wide[1][i], wide[2][i]], [x + y, x - y, x * y]);

@@ -304,6 +304,28 @@ impl<S: Scalar> Poses<S> {
         }
     }
 
+    /// What a force `f` at a point `p` that a joint carries, and a couple `c`, push along the joint's coordinate.
+    ///
+    /// ```text
+    /// hinge: axis · ((p − o) × f + c)      slider: axis · f      screw: both
+    /// ```
+    #[inline(always)]
+    pub(crate) fn pushed(
+        &self,
+        tree: &Tree,
+        joint: usize,
+        (point, force): (Vec3<S>, Vec3<S>),
+        couple: Vec3<S>,
+    ) -> S {
+        let (axis, arm) = (self.axis(tree, joint), point - self.place(tree, joint));
+        let turned = || axis.dot(arm.cross(force) + couple);
+        match tree.joints[joint].kind {
+            JointKind::Prismatic => axis.dot(force),
+            JointKind::Revolute | JointKind::Ball(_) => turned(),
+            JointKind::Screw(pitch) => turned() + axis.dot(force) * pitch,
+        }
+    }
+
     /// Derivative of a free vector carried by a joint by the joint's coordinate.
     #[inline]
     pub(crate) fn turned(&self, tree: &Tree, joint: usize, vector: Vec3<S>) -> Vec3<S> {

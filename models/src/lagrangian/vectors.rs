@@ -326,22 +326,40 @@ impl<'a, S: Scalar> ProductAt<'a, S> {
     /// Derivatives of `u` and `w` by the coordinate of a joint on the path.
     #[inline(always)]
     pub(crate) fn gradients(&self, joint: &PathJoint) -> [Vec3<S>; 2] {
-        [(self.product.u, self.u), (self.product.w, self.w)].map(|(vector, value)| {
-            match (vector, joint.carries) {
-                (Vector::Difference, _) => joint.gradient(self.tree, self.poses, &self.at),
-                (Vector::WithA(_), Carries::A) | (Vector::WithB(_), Carries::B) => {
-                    self.poses.turned(self.tree, joint.joint, value)
-                }
-                _ => Vec3::ZERO,
-            }
-        })
+        [self.gradient(joint, self.product.u, self.u), self.gradient(joint, self.product.w, self.w)]
     }
 
-    /// Calls `entry(i, h_i)` for each joint on the path.
+    #[inline(always)]
+    fn gradient(&self, joint: &PathJoint, vector: Vector, value: Vec3<S>) -> Vec3<S> {
+        match (vector, joint.carries) {
+            (Vector::Difference, _) => joint.gradient(self.tree, self.poses, &self.at),
+            (Vector::WithA(_), Carries::A) | (Vector::WithB(_), Carries::B) => {
+                self.poses.turned(self.tree, joint.joint, value)
+            }
+            _ => Vec3::ZERO,
+        }
+    }
+
+    /// Calls `entry(i, h_i)` for each joint on the path. Each vector pulls at the other: a difference by its points,
+    /// a direction as a couple, `w·(ω × u) = ω·(u × w)`.
     pub(crate) fn for_each_derivative(&self, mut entry: impl FnMut(usize, S)) {
-        for joint in &self.product.points.path {
-            let [u, w] = self.gradients(joint);
-            entry(joint.coordinate, u.dot(self.w) + self.u.dot(w));
+        let (mut forces, mut couples) = ([Vec3::ZERO; 2], [Vec3::ZERO; 2]);
+        let Self { product, tree, poses, at, u, w } = self;
+        for (vector, own, other) in [(product.u, u, w), (product.w, w, u)] {
+            match vector {
+                Vector::Difference => forces = [*other, -*other],
+                Vector::WithA(_) => couples[0] += own.cross(*other),
+                Vector::WithB(_) => couples[1] += own.cross(*other),
+            }
+        }
+        let ([at_a, at_b], [turning_a, turning_b]) = (forces, couples);
+        for path in &product.points.path {
+            let (point, force, couple) = match path.carries {
+                Carries::A => (at.a, at_a, turning_a),
+                Carries::B => (at.b, at_b, turning_b),
+                Carries::Both => continue,
+            };
+            entry(path.coordinate, poses.pushed(tree, path.joint, (point, force), couple));
         }
     }
 
