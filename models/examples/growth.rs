@@ -7,6 +7,7 @@
 //! held where it is, with `-- dragged` one that goes with a hook as it is moved, and with `-- welded` one whose rod is held
 
 use std::error::Error;
+use std::f64::consts::TAU;
 use std::hint::black_box;
 use std::sync::Arc;
 
@@ -151,7 +152,12 @@ fn main() -> Result<(), Box<dyn Error>> {
             spare.start(&Initial::Scene)?
         } else {
             // A bent rope, whose tip goes where it is held.
-            let bent = |i: usize| if i < d.dynamic { 4.0 / joints as f64 } else { 0.0 };
+            let bent = |i: usize| match kind.as_str() {
+                _ if i >= d.dynamic => 0.0,
+                // Upright at its end.
+                "welded" => 8.0 / joints as f64 * (TAU * i as f64 / d.dynamic as f64).sin(),
+                _ => 4.0 / joints as f64,
+            };
             let q = (0..d.coordinates()).map(bent).collect();
             spare.start(&Initial::Projection { q, hold: Vec::new() })?
         };

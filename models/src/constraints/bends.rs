@@ -204,14 +204,17 @@ impl<const L: usize> Sums<L> {
     #[inline(always)]
     pub(crate) fn products(&self, joints: &[Bend]) -> impl Iterator<Item = (usize, [f64; L])> {
         let Self { above, below } = self;
-        joints.iter().map(move |bend| {
-            let mut product = dot(&below[bend.first], bend.axis);
-            if let Some(above) = above.get(joints[bend.first].parent) {
-                let turned = dot(above, bend.torque);
-                product.iter_mut().zip(turned).for_each(|(product, turned)| *product += turned);
-            }
-            (bend.coordinate, product)
-        })
+        joints.iter().map(
+            #[inline(always)]
+            move |bend| {
+                let mut product = dot(&below[bend.first], bend.axis);
+                if let Some(above) = above.get(joints[bend.first].parent) {
+                    let turned = dot(above, bend.torque);
+                    product.iter_mut().zip(turned).for_each(|(product, turned)| *product += turned);
+                }
+                (bend.coordinate, product)
+            },
+        )
     }
 }
 

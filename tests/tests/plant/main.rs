@@ -4,3 +4,4 @@ mod alloc;
 mod callgrind;
 mod closed_loop;
 mod reference;
+mod registers;

@@ -103,10 +103,18 @@ pub(crate) fn combined<E: Eight, const B: usize, const L: usize>(
 ) -> InLine<E, B> {
     let mut sum = InLine::ZERO;
     unrolled!(3, b < B, {
-        let (lines, Block(v)) = (&lines[b], &v.0[b]);
-        let two = |k: usize| lines[k].scaled(v[k]).plus(lines[k + 4].scaled(v[k + 4]));
-        let own = two(0).plus(two(2)).plus(two(1).plus(two(3)));
+        let of = (&lines[b], &v.0[b]);
+        let own = two(of, 0).plus(two(of, 2)).plus(two(of, 1).plus(two(of, 3)));
         sum = if b == 0 { own } else { sum.plus(own) };
     });
     sum
+}
+
+/// Two of them. No closure: one that is called so often is not inlined, and then has no registers of the processor's.
+#[inline(always)]
+fn two<E: Eight, const B: usize>(
+    (lines, Block(v)): (&[InLine<E, B>; 8], &Block),
+    k: usize,
+) -> InLine<E, B> {
+    lines[k].scaled(v[k]).plus(lines[k + 4].scaled(v[k + 4]))
 }
