@@ -154,7 +154,8 @@ macro_rules! first_four {
         #[inline(always)]
         fn collect(rows: &[Block]) -> [Self; 8] {
             let [a, b, c, d, ..] = rows else { return [Self::ZERO; 8] };
-            let [a, b, c, d] = [a, b, c, d].map(|row| Halves::<Self>::of(row).0);
+            let of = Halves::<Self>::of;
+            let (a, b, c, d) = (of(a).0, of(b).0, of(c).0, of(d).0);
             let [p, q, r, s] = Self::transposed_four([a[0], b[0], c[0], d[0]]);
             let [t, u, v, w] = Self::transposed_four([a[1], b[1], c[1], d[1]]);
             [p, q, r, s, t, u, v, w]
@@ -311,13 +312,11 @@ impl Pair {
 impl Four for Pairs {
     #[inline(always)]
     fn transposed_four([a, b, c, d]: [Self; 4]) -> [Self; 4] {
-        let of = |k: usize| {
-            let [p, q] = Pair::transposed([a.0[k], b.0[k]]);
-            let [r, s] = Pair::transposed([c.0[k], d.0[k]]);
-            [Self([p, r]), Self([q, s])]
-        };
-        let ([p, q], [r, s]) = (of(0), of(1));
-        [p, q, r, s]
+        let [p, q] = Pair::transposed([a.0[0], b.0[0]]);
+        let [r, s] = Pair::transposed([c.0[0], d.0[0]]);
+        let [t, u] = Pair::transposed([a.0[1], b.0[1]]);
+        let [v, w] = Pair::transposed([c.0[1], d.0[1]]);
+        [Self([p, r]), Self([q, s]), Self([t, v]), Self([u, w])]
     }
 }
 
