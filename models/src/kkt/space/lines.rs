@@ -111,7 +111,9 @@ pub(crate) fn combined<E: Eight, const B: usize, const L: usize>(
 }
 
 /// Two of them. No closure: one that is called so often is not inlined, and then has no registers of the processor's.
-#[inline(always)]
+/// Without optimisation, which comes with assertions, hundreds of them in one function would take 16 MiB of its stack.
+#[cfg_attr(not(debug_assertions), inline(always))]
+#[cfg_attr(debug_assertions, inline(never))]
 fn two<E: Eight, const B: usize>(
     (lines, Block(v)): (&[InLine<E, B>; 8], &Block),
     k: usize,
