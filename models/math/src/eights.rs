@@ -141,6 +141,10 @@ pub fn in_eights<T: InEights>(task: T) -> T::Output {
         fn avx2<T: InEights>(task: T) -> T::Output {
             task.run::<Halves<Low>>()
         }
+        // A function of its own: without optimisation, what it needs of the stack is not under the others.
+        fn all_have<T: InEights>(task: T) -> T::Output {
+            task.run::<Halves<Pairs>>()
+        }
         if has(AVX512) {
             // SAFETY: the processor has AVX-512.
             return unsafe { avx512(task) };
@@ -149,7 +153,7 @@ pub fn in_eights<T: InEights>(task: T) -> T::Output {
             // SAFETY: the processor has AVX2.
             return unsafe { avx2(task) };
         }
-        task.run::<Halves<Pairs>>()
+        all_have(task)
     }
     #[cfg(not(target_arch = "x86_64"))]
     task.run::<Block>()
