@@ -103,6 +103,15 @@ pub trait Eight: Copy + 'static {
         }
         Self::collect(&eight)
     }
+    /// Does something in a function of its own that has these registers: what is large, and done in many places.
+    #[inline(always)]
+    fn apart<R>(task: impl FnOnce() -> R) -> R {
+        #[inline(never)]
+        fn own<R>(task: impl FnOnce() -> R) -> R {
+            task()
+        }
+        own(task)
+    }
     /// All numbers times a factor.
     #[inline(always)]
     fn scaled(self, factor: f64) -> Self {
@@ -141,10 +150,6 @@ pub fn in_eights<T: InEights>(task: T) -> T::Output {
         fn avx2<T: InEights>(task: T) -> T::Output {
             task.run::<Halves<Low>>()
         }
-        // A function of its own: without optimisation, what it needs of the stack is not under the others.
-        fn all_have<T: InEights>(task: T) -> T::Output {
-            task.run::<Halves<Pairs>>()
-        }
         if has(AVX512) {
             // SAFETY: the processor has AVX-512.
             return unsafe { avx512(task) };
@@ -153,7 +158,7 @@ pub fn in_eights<T: InEights>(task: T) -> T::Output {
             // SAFETY: the processor has AVX2.
             return unsafe { avx2(task) };
         }
-        all_have(task)
+        task.run::<Halves<Pairs>>()
     }
     #[cfg(not(target_arch = "x86_64"))]
     task.run::<Block>()

@@ -83,6 +83,22 @@ macro_rules! number_by_number {
     };
 }
 
+/// A function of its own with a feature of the processor.
+macro_rules! apart {
+    ($feature:literal) => {
+        #[inline(always)]
+        fn apart<R>(task: impl FnOnce() -> R) -> R {
+            #[inline(never)]
+            #[target_feature(enable = $feature)]
+            fn own<R>(task: impl FnOnce() -> R) -> R {
+                task()
+            }
+            // SAFETY: there are such registers.
+            unsafe { own(task) }
+        }
+    };
+}
+
 /// What is done with each half by itself.
 macro_rules! half_by_half {
     ($numbers:literal, $half:ty) => {
@@ -190,6 +206,7 @@ impl Whole {
 impl Eight for Whole {
     type Four = Low;
     type One = Self;
+    apart! { "avx512f" }
     number_by_number! {
         8, _mm512_loadu_pd, _mm512_storeu_pd, _mm512_set1_pd, _mm512_add_pd, _mm512_sub_pd, _mm512_mul_pd,
         _mm512_div_pd, _mm512_sqrt_pd
@@ -252,6 +269,7 @@ impl Four for Low {
 
 impl Eight for Low {
     first_four! {}
+    apart! { "avx2" }
     number_by_number! {
         4, _mm256_loadu_pd, _mm256_storeu_pd, _mm256_set1_pd, _mm256_add_pd, _mm256_sub_pd, _mm256_mul_pd,
         _mm256_div_pd, _mm256_sqrt_pd
@@ -329,6 +347,10 @@ impl<F: Four> Eight for Halves<F> {
     type Four = F;
     type One = F;
     half_by_half! { 4, F }
+    #[inline(always)]
+    fn apart<R>(task: impl FnOnce() -> R) -> R {
+        F::apart(task)
+    }
     #[inline(always)]
     fn transposed([a, b, c, d, e, f, g, h]: [Self; 8]) -> [Self; 8] {
         let p = F::transposed_four([a.0[0], b.0[0], c.0[0], d.0[0]]);

@@ -101,6 +101,21 @@ pub(crate) fn combined<E: Eight, const B: usize, const L: usize>(
     lines: &Lines<E, B>,
     v: &Line<L>,
 ) -> InLine<E, B> {
+    if B == 1 {
+        return sum_of(lines, v);
+    }
+    // Written out wherever it is used, this was most of the kernels, and most of their compilation.
+    E::apart(
+        #[inline(always)]
+        || sum_of(lines, v),
+    )
+}
+
+#[inline(always)]
+fn sum_of<E: Eight, const B: usize, const L: usize>(
+    lines: &Lines<E, B>,
+    v: &Line<L>,
+) -> InLine<E, B> {
     let mut sum = InLine::ZERO;
     unrolled!(3, b < B, {
         let of = (&lines[b], &v.0[b]);
@@ -110,10 +125,8 @@ pub(crate) fn combined<E: Eight, const B: usize, const L: usize>(
     sum
 }
 
-/// Two of them. No closure: one that is called so often is not inlined, and then has no registers of the processor's.
-/// Without optimisation, which comes with assertions, hundreds of them in one function would take 16 MiB of its stack.
-#[cfg_attr(not(debug_assertions), inline(always))]
-#[cfg_attr(debug_assertions, inline(never))]
+/// Two of them. A closure that is called so often would not be inlined, and then has no registers of the processor's.
+#[inline(always)]
 fn two<E: Eight, const B: usize>(
     (lines, Block(v)): (&[InLine<E, B>; 8], &Block),
     k: usize,
