@@ -20,7 +20,7 @@ pub(super) struct Halves<F>([F; 2]);
 pub(super) struct Low(__m256d);
 
 /// The same in two registers of SSE2, which all x86-64 processors have. Ropes of 32 and 64 joints take 0.55 of the time of
-/// a step that they take number by number, as processors of other kinds do it, and with derivatives 0.7.
+/// a step that they take number by number, as processors of other kinds do it, and with A and B 0.7.
 #[derive(Clone, Copy)]
 pub(super) struct Pairs([Pair; 2]);
 
