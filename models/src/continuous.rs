@@ -35,7 +35,6 @@ use plantd_math::tree_lu::TreeLu;
 
 use crate::constraints::closure::Closure;
 use crate::kkt::schur::SchurComplement;
-use crate::lagrangian::armature;
 use crate::lagrangian::derivatives::Derivatives;
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
@@ -587,7 +586,7 @@ impl Equations<f64> {
         let (mut l_q, mut l_v) = (vec![Dual::ZERO; n], vec![Dual::ZERO; n]);
         poses.evaluate(tree, &along_q, &self.turned(model));
         momenta.gradient(tree, &poses, &along_v, model.gravity, &mut l_q, &mut l_v);
-        armature::add_momentum(&model.armature, &along_v, &mut l_v);
+        model.armature.add_momentum(&along_v, &mut l_v);
         let mut forces = vec![0.0; n];
         write_rates(model, &self.v, [&l_q, &l_v], &mut forces);
         forces

@@ -53,7 +53,7 @@ impl Model {
                     Blocks::Two => (2950.0, 77.0),
                     Blocks::Three => (7850.0, 154.0),
                 };
-                let (acted_on, ties) = (self.acted_on() as f64, self.tied_rows() as f64);
+                let (acted_on, ties) = (self.acted_on() as f64, self.tied_rows as f64);
                 let solution = 110.0 + 93.0 * joints + correction * acted_on;
                 // Each row of a tie is solved for, and met with all others.
                 let closing = ties * (solution + nd * (40.0 + ties)) + 2.0 * ties.powi(3);

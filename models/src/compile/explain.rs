@@ -83,7 +83,7 @@ impl Model {
                 } else {
                     ""
                 };
-                let ties = match self.tied_rows() {
+                let ties = match self.tied_rows {
                     rows if rows > 0 && self.solver == Solver::Spatial => {
                         format!(", {rows} rows of ties")
                     }

@@ -8,7 +8,7 @@ use crate::lagrangian::instant::Instant;
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
 use crate::model::manifold::orientations;
-use crate::model::mechanism::{Armature, Forces, MixedPair, Model, Pair, Potentials, Spring};
+use crate::model::mechanism::{Armatures, Forces, MixedPair, Model, Pair, Potentials, Spring};
 use crate::model::tree::Tree;
 
 /// Which dynamic coordinates each one is coupled with, among those before it.
@@ -16,7 +16,7 @@ pub(super) fn couplings(
     dynamic: usize,
     tree: &Tree,
     potentials: &Potentials,
-    armature: &[Armature],
+    armature: &Armatures,
     forces: Option<&Forces>,
 ) -> Vec<BTreeSet<usize>> {
     let mut couplings = vec![BTreeSet::new(); dynamic];
@@ -31,7 +31,7 @@ pub(super) fn couplings(
             couple(tree.joints[above].coordinate, tree.joints[joint].coordinate);
         }
     }
-    armature.iter().for_each(|a| couple(a.row, a.column));
+    armature.entries().for_each(|a| couple(a.row, a.column));
     let of_springs = potentials.springs.iter().map(Spring::couples);
     let of_forces = forces.into_iter().flat_map(Forces::couples);
     for coordinates in of_springs.chain(of_forces) {
@@ -121,8 +121,13 @@ mod tests {
     /// Its elimination without what springs and forces couple.
     fn without_couplings(mut model: Model) -> Model {
         let (nd, tree) = (model.dimensions.dynamic, &model.dynamics);
-        model.elimination =
-            SymbolicElimination::new(&couplings(nd, tree, &Potentials::default(), &[], None));
+        model.elimination = SymbolicElimination::new(&couplings(
+            nd,
+            tree,
+            &Potentials::default(),
+            &Armatures::default(),
+            None,
+        ));
         model
     }
 

@@ -15,9 +15,9 @@ use crate::compile::pattern::{couplings, joint_pairs};
 use crate::compile::{inertia, pattern, settling};
 use crate::model::conditioning::Conditioning;
 use crate::model::mechanism::{
-    Alignment, AlongAxis, Armature, Carries, Constraint, ConstraintKind, Coordinate, Coupling,
+    Alignment, AlongAxis, Armatures, Carries, Constraint, ConstraintKind, Coordinate, Coupling,
     Dimensions, Forces, Length, Model, Mover, OperatingPoint, PathJoint, PathLength, PointDistance,
-    PointPair, Polynomial, Product, Solver, Vector,
+    PointPair, Polynomial, Product, Solver, SumArmature, Vector,
 };
 use crate::model::planar_tree::{crooked, planar};
 use crate::model::site::Site;
@@ -94,8 +94,8 @@ fn assemble(scene: &Scene, layout: Layout) -> Model {
 
     let mut potentials = layout.potentials(scene, &dynamics, &in_dynamics);
     let armature = layout.armature(scene);
-    potentials.any |= !armature.is_empty();
-    potentials.couple_branches |= armature.iter().any(|a| a.row != a.column);
+    potentials.any |= armature.entries().next().is_some();
+    potentials.couple_branches |= !armature.sums.is_empty();
     let equations = layout.equations(scene, &closure, &in_closure);
 
     let forces = layout.forces(scene, &dynamics, &in_dynamics);
@@ -123,6 +123,7 @@ fn assemble(scene: &Scene, layout: Layout) -> Model {
     let mut model = Model {
         acting: None,
         has_ties: false,
+        tied_rows: 0,
         impulses: 0,
         foresees_elements: false,
         conditioning: Conditioning::default(),
@@ -372,29 +373,27 @@ impl Layout {
         self.frames[frame].rotation.apply(direction)
     }
 
-    /// What armatures of coordinates and of sums add to the mass matrix.
-    fn armature(&self, scene: &Scene) -> Vec<Armature> {
-        let mut entries: BTreeMap<(usize, usize), f64> = BTreeMap::new();
+    /// Armatures of coordinates and of sums.
+    fn armature(&self, scene: &Scene) -> Armatures {
+        let mut own: BTreeMap<usize, f64> = BTreeMap::new();
+        let mut sums = Vec::new();
         for coordinate in scene.coordinates.iter().filter(|c| c.armature > 0.0) {
-            let i = self.index[&coordinate.name];
-            *entries.entry((i, i)).or_default() += coordinate.armature;
+            *own.entry(self.index[&coordinate.name]).or_default() += coordinate.armature;
         }
         for sum in scene.armatures.iter().filter(|sum| sum.armature > 0.0) {
-            let terms = self.linear(&sum.terms);
-            for (&(i, row), &(j, column)) in
-                terms.iter().flat_map(|row| terms.iter().map(move |column| (row, column)))
-            {
-                *entries.entry((i, j)).or_default() += sum.armature * row * column;
+            let (terms, inertia) = (self.linear(&sum.terms), sum.armature);
+            match terms[..] {
+                [(i, c)] => *own.entry(i).or_default() += inertia * c * c,
+                _ => sums.push(SumArmature { terms, inertia }),
             }
         }
-        let entry = |((row, column), inertia)| Armature { row, column, inertia };
-        entries.into_iter().map(entry).collect()
+        Armatures { own: own.into_iter().collect(), sums }
     }
 
     /// Which joints the walks of the dynamics and of the constraints need: a joint is needed where it, or a joint below it, carries what the walk evaluates.
     fn needs(&self, scene: &Scene) -> [Vec<bool>; 2] {
         let has_body = |joint: &Joint| !matches!(joint.body.inertia, Rotational::None);
-        let armature: BTreeSet<usize> = self.armature(scene).into_iter().map(|a| a.row).collect();
+        let armature: BTreeSet<usize> = self.armature(scene).entries().map(|a| a.row).collect();
         let resists = |joint: &Joint| has_body(joint) || armature.contains(&joint.coordinate);
         let mut dynamics: Vec<bool> = self.joints.iter().map(resists).collect();
         let mut closure = vec![false; self.joints.len()];

@@ -11,7 +11,6 @@
 
 use plantd_scene::{Scene, Spring};
 
-use crate::lagrangian::armature;
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
 use crate::model::manifold::orientations;
@@ -60,7 +59,7 @@ fn inertia(model: &Model, i: usize) -> f64 {
     let [mut l_q, mut l_v] = [0; 2].map(|_| vec![0.0; model.dimensions.dynamic]);
     poses.evaluate(tree, &q, &orientations(model, &q));
     momenta.gradient(tree, &poses, &velocity, None, &mut l_q, &mut l_v);
-    armature::add_momentum(&model.armature, &velocity, &mut l_v);
+    model.armature.add_momentum(&velocity, &mut l_v);
     l_v[i]
 }
 

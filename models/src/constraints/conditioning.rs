@@ -178,7 +178,7 @@ pub(crate) fn sample(model: &Model, k: usize, slide: f64) -> Vec<f64> {
 pub(crate) fn inertia(model: &Model) -> Vec<f64> {
     let mut inertia = vec![0.0; model.dimensions.dynamic];
     // The others of a sum may turn the other way as fast, for each that has an inertia of its own.
-    model.armature.iter().for_each(|a| inertia[a.row] += a.inertia.abs());
+    model.armature.entries().for_each(|a| inertia[a.row] += a.inertia.abs());
     let joints = &model.dynamics.joints;
     for (b, carrier) in joints.iter().enumerate() {
         let body = &carrier.body;

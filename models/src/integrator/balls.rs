@@ -26,7 +26,6 @@ use crate::integrator::ball_maps::{ToMatrices, ToMidpoint, TurnOn, Weigh, beside
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::{Tangents, Workspace};
-use crate::lagrangian::armature;
 use crate::lagrangian::curvature::Curvature;
 use crate::lagrangian::generators::{Flanks, Generators, MatrixKind, Step, of_ball};
 use crate::lagrangian::turning::{Turning, Weights};
@@ -225,11 +224,10 @@ impl Workspace {
                 weights.own.0[b] += weights.torque.0[b] * (-a * c);
             }
         }
-        for a in &model.armature {
-            // Sums have no component of an orientation.
-            if let Some((o, axis)) = balls.of(a.row) {
+        for &(i, inertia) in &model.armature.own {
+            if let Some((o, axis)) = balls.of(i) {
                 let weights = &mut kkt.balls[o];
-                weights.own.0[axis] += weights.momentum.0[axis] * (-a.inertia / h);
+                weights.own.0[axis] += weights.momentum.0[axis] * (-inertia / h);
             }
         }
     }
@@ -299,8 +297,8 @@ impl Workspace {
                 }
             });
         }
-        for entry in model.armature.iter().filter(|entry| balls.of(entry.row).is_none()) {
-            armature::add_to(matrix, model, entry, -1.0 / h);
+        for entry in model.armature.entries().filter(|entry| balls.of(entry.row).is_none()) {
+            entry.add_to(matrix, model, -1.0 / h);
         }
         for (i, c) in model.damping.iter().enumerate().filter(|(i, _)| balls.of(*i).is_none()) {
             let slot = model.elimination.diagonal(i);

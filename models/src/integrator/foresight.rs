@@ -265,9 +265,7 @@ impl Workspace {
         if model.orientations.is_empty() {
             return;
         }
-        for a in &model.armature {
-            nudge.l_v[a.row] += a.inertia * nudge.velocity[a.column];
-        }
+        model.armature.add_momentum(&nudge.velocity, &mut nudge.l_v);
         // Of m × ξ.
         for (o, i) in orientations() {
             let (m, x) = (three(&mid.l_v, i), three(corrections, i));

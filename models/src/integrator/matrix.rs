@@ -124,8 +124,8 @@ impl Workspace {
     pub(super) fn factor_masses(&mut self, model: &Model, settings: &Settings) -> bool {
         self.kkt.diagonal.fill(0.0);
         self.kkt.balls.fill(Weights::REST);
-        for armature in &model.armature {
-            let (i, added) = (armature.row, -armature.inertia / settings.time_step_s);
+        for &(i, inertia) in &model.armature.own {
+            let added = -inertia / settings.time_step_s;
             match self.balls.of(i) {
                 Some((o, axis)) => self.kkt.balls[o].own.0[axis].0[axis] = added,
                 None => self.kkt.diagonal[i] = added,

@@ -11,10 +11,10 @@ use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::lagrangian::arrangement::Planar;
 use crate::lagrangian::fields::{Fields, OwnTorque};
+use crate::lagrangian::forces;
 use crate::lagrangian::instant::Instant;
 use crate::lagrangian::kinematics::Place;
 use crate::lagrangian::mechanics::Mechanics;
-use crate::lagrangian::{armature, forces};
 use crate::model::mechanism::{Forces, Model, Mover, Spring};
 use crate::model::tree::JointKind;
 
@@ -155,7 +155,7 @@ impl<S: Planar> Midpoint<S> {
         );
         if model.potentials.any {
             model.add_spring_gradient(&self.mechanics.poses, &self.q, l_q);
-            armature::add_momentum(&model.armature, &self.velocity, l_v);
+            model.armature.add_momentum(&self.velocity, l_v);
         }
         if !model.damping.is_empty() {
             forces::add_damping(&model.damping, &self.velocity, &self.input_force, force);
@@ -188,9 +188,7 @@ impl<S: Planar> Midpoint<S> {
                     matrix.add(&model.elimination, i, j, value * (-0.25 * h));
                 }
             });
-            for entry in &model.armature {
-                armature::add_to(matrix, model, entry, -1.0 / h);
-            }
+            model.armature.entries().for_each(|entry| entry.add_to(matrix, model, -1.0 / h));
         }
         for (i, c) in model.damping.iter().enumerate() {
             let slot = model.elimination.diagonal(i);
@@ -201,7 +199,7 @@ impl<S: Planar> Midpoint<S> {
         }
     }
 
-    /// What springs, armatures, dampers and forces of coordinates add to the diagonal of `K`.
+    /// What springs, armatures, dampers and forces of single coordinates add to the diagonal of `K`.
     pub(crate) fn fill_diagonal(&self, model: &Model, settings: &Settings, diagonal: &mut [S]) {
         let h = settings.time_step_s;
         diagonal.fill(S::ZERO);
@@ -213,8 +211,8 @@ impl<S: Planar> Midpoint<S> {
             };
             let spring = |i: usize, value: S| add(i, value * (0.25 * h));
             model.for_each_own_spring_derivative(&self.mechanics.poses, &self.q, spring);
-            for armature in &model.armature {
-                add(armature.row, S::constant(armature.inertia / h));
+            for &(i, inertia) in &model.armature.own {
+                add(i, S::constant(inertia / h));
             }
         }
         let a = settings.force_split.at_start();

@@ -122,7 +122,7 @@ pub(crate) struct Tangents {
     pub(crate) pushes: Pushes,
     /// `Σ λ D²h` there.
     pub(crate) bending: Option<Box<Bending>>,
-    /// For linearizations by generators, with ties.
+    /// For linearizations by generators, with rows of ties.
     pub(crate) tied: Option<Box<TiedTangents>>,
     pub(crate) terms: Vec<Term>,
 }
@@ -146,7 +146,7 @@ impl Tangents {
             self.bending = Some(Box::new(Bending::new(model, stride)));
             self.pushes = Pushes::new(model, stride, nc);
         }
-        if model.has_ties {
+        if model.tied_rows > 0 {
             self.tied = Some(Box::new(TiedTangents::new(model, stride)));
         }
     }

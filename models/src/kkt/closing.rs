@@ -9,6 +9,7 @@
 //!
 //! multipliers               R = A0     V = 0              C = A1     E = 0
 //! forces of ties, opposed   R          V = 2 ∂y/∂q − R    C = G      E = 1
+//! of armatures, opposed     R          V = −R             C = G      E = 1
 //! ```
 //!
 //! `X` and `P` are the derivatives without them, of which no more is needed than products.

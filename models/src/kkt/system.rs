@@ -132,7 +132,7 @@ impl KktSystem {
     pub(crate) fn new(model: &Model, stride: usize) -> Self {
         let nd = model.dimensions.dynamic;
         let entries = model.elimination.entries();
-        let is_closed = model.dimensions.constraints > 0 || model.has_ties;
+        let is_closed = model.dimensions.constraints > 0 || model.tied_rows > 0;
         // Limbs that are held have a linearization of their own.
         let mut in_space = (model.is_generated_in_space() && model.held.is_none())
             .then(|| Derivatives::new(model))
@@ -142,7 +142,7 @@ impl KktSystem {
         }
         let is_generated = in_space.is_some() || model.solver == Solver::Spatial;
         let fields = (is_generated && model.has_fields()).then(|| Box::new(Fields::new(model)));
-        let is_tied = is_generated && model.has_ties;
+        let is_tied = is_generated && model.tied_rows > 0;
         Self {
             factored: Factored::new(model),
             in_space,
@@ -225,7 +225,9 @@ impl KktSystem {
                 let pivot =
                     recursion.factor(model, (&mechanics.curvature, added), time_step_s, kind);
                 if let Some(tied) = &mut self.tied {
-                    tied.is_idle = kind == MatrixKind::Mass;
+                    if kind == MatrixKind::Mass {
+                        tied.weigh_masses(time_step_s);
+                    }
                     // A pivot that is too small may be one by the generators alone.
                     if !tied.is_idle
                         && (pivot.relative < singular_below || !tied.factor(|x| recursion.solve(x)))

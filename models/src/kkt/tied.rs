@@ -1,4 +1,4 @@
-//! Ties in a system that is solved by generators: a product of few rows more.
+//! Ties, and armatures of sums of coordinates, in a system that is solved by generators: a product of few rows more.
 //!
 //! ```text
 //! K = K_gen + R G      K⁻¹ b = y − Y (1 + G Y)⁻¹ G y      y = K_gen⁻¹ b      Y = K_gen⁻¹ R
@@ -10,6 +10,12 @@
 //! ```text
 //! R_i = T⁻ ∂y/∂q      G_j = ¼h Cᵀ ∂T/∂q + ½ ∂T/∂v
 //! ```
+//!
+//! and of an armature `a` of the sum `Σ c_i q_i`
+//!
+//! ```text
+//! R_i = c_i           G_j = −a c_j / h
+//! ```
 
 use plantd_math::pivoted_lu::PivotedLu;
 use plantd_math::rows::{AlignedRows, Term, add_rows, dot, non_zero, padded};
@@ -20,7 +26,7 @@ use crate::kkt::pushes::Pushes;
 use crate::kkt::space::columns::Rows;
 use crate::lagrangian::ties::{Entry, Ties};
 use crate::lagrangian::turning::{Turning, Weights};
-use crate::model::mechanism::Model;
+use crate::model::mechanism::{Model, SumArmature};
 
 /// The least pivot of `1 + G Y`, relative to the largest, that is taken: else matrices are filled entry by entry.
 const SOUND: f64 = 1e-10;
@@ -30,14 +36,19 @@ const SOUND: f64 = 1e-10;
 pub(crate) struct Tied {
     pub(crate) ties: Ties,
     nd: usize,
-    /// `R`, `G` and `Y`, a row of nd for each tie.
+    /// Armatures have the last rows.
+    armatures: Vec<SumArmature>,
+    /// `R`, `G` and `Y`, a row of nd for each tie and each armature.
     pushes: Vec<f64>,
     changes: Vec<f64>,
     responses: Vec<f64>,
+    /// What their forces `φ` give to the momentum at the end at a fixed increment: `2 ∂y/∂q − R` of ties, and `−R` of
+    /// armatures, which give the opposite of what they give to the residual.
+    momenta: Vec<f64>,
     lu: PivotedLu,
     /// `G y`.
     forces: Vec<f64>,
-    /// Factored are masses, to which ties give nothing.
+    /// Factored are masses, to which they give nothing.
     pub(crate) is_idle: bool,
 }
 
@@ -55,7 +66,7 @@ pub(crate) struct TiedTangents {
 impl TiedTangents {
     /// Room for those of a model, with rows of its linearization that are so long.
     pub(crate) fn new(model: &Model, stride: usize) -> Self {
-        let (nd, count) = (model.dimensions.dynamic, model.tied_rows());
+        let (nd, count) = (model.dimensions.dynamic, model.tied_rows);
         Self {
             pushes: Pushes::new(model, stride, count),
             increments: vec![0.0; nd * padded(count)],
@@ -68,14 +79,23 @@ impl TiedTangents {
 impl Tied {
     /// Room for the ties of a model, and for right-hand sides in rows of so many.
     pub(crate) fn new(model: &Model, stride: usize) -> Self {
-        let (nd, count) = (model.dimensions.dynamic, model.tied_rows());
+        let (nd, count) = (model.dimensions.dynamic, model.tied_rows);
         let zeros = || vec![0.0; count * nd];
+        let (ties, armatures) = (Ties::new(model), model.armature.sums.clone());
+        let [mut pushes, mut momenta] = [zeros(), zeros()];
+        for (row, armature) in (ties.rows().len()..).zip(&armatures) {
+            for &(i, c) in &armature.terms {
+                (pushes[row * nd + i], momenta[row * nd + i]) = (c, -c);
+            }
+        }
         Self {
-            ties: Ties::new(model),
+            ties,
             nd,
-            pushes: zeros(),
+            armatures,
+            pushes,
             changes: zeros(),
             responses: zeros(),
+            momenta,
             lu: PivotedLu::new(&vec![1.0; count], stride).with_independent(count),
             forces: vec![0.0; count],
             is_idle: true,
@@ -84,10 +104,13 @@ impl Tied {
 
     /// Finds `R` and `G` at the last evaluation of the ties.
     pub(crate) fn weigh(&mut self, model: &Model, balls: &[Weights], time_step_s: f64) {
-        let Self { ties, nd, pushes, changes, .. } = self;
+        self.weigh_armatures(time_step_s);
+        self.is_idle = false;
+        let Self { ties, nd, pushes, changes, momenta, .. } = self;
         let (quarter, half) = (0.25 * time_step_s, 0.5);
-        let rows = ties.rows().zip(pushes.chunks_exact_mut(*nd)).zip(changes.chunks_exact_mut(*nd));
-        for ((row, pushes), changes) in rows {
+        let pushed = pushes.chunks_exact_mut(*nd).zip(momenta.chunks_exact_mut(*nd));
+        let rows = ties.rows().zip(changes.chunks_exact_mut(*nd)).zip(pushed);
+        for ((row, changes), (pushes, momenta)) in rows {
             let entries = row.iter().zip(&mut *pushes).zip(&mut *changes);
             for ((entry, push), change) in entries {
                 *push = entry.length;
@@ -101,6 +124,22 @@ impl Tied {
                     put(changes, i, change + velocity * half);
                 }
             }
+            let entries = momenta.iter_mut().zip(row).zip(&*pushes);
+            entries.for_each(|((momentum, entry), push)| *momentum = 2.0 * entry.length - push);
+        }
+    }
+
+    /// Finds `G` of masses, to which ties give nothing.
+    pub(crate) fn weigh_masses(&mut self, time_step_s: f64) {
+        self.changes.fill(0.0);
+        self.weigh_armatures(time_step_s);
+        self.is_idle = self.armatures.is_empty();
+    }
+
+    fn weigh_armatures(&mut self, time_step_s: f64) {
+        let rows = self.changes.chunks_exact_mut(self.nd).skip(self.ties.rows().len());
+        for (changes, SumArmature { terms, inertia }) in rows.zip(&self.armatures) {
+            terms.iter().for_each(|&(i, c)| changes[i] = -inertia * c / time_step_s);
         }
     }
 
@@ -133,10 +172,11 @@ impl Tied {
     }
 
     /// From a linearization by the generators alone, whose increments are `X θ'` and momenta `P θ'`, makes that with
-    /// the ties. Their forces `φ` give `R φ` to the residual and `2 ∂y/∂q φ` to the momentum:
+    /// the ties. Their forces `φ` give `R φ` to the residual and `V φ` to the momentum, of ties
+    /// `V = 2 ∂y/∂q − R`, of armatures `−R`:
     ///
     /// ```text
-    /// φ' = G x' + G_θ θ'      x' = X θ' + X_p R φ'      p[k+1]' = P θ' + (P_p R + 2 ∂y/∂q − R) φ'
+    /// φ' = G x' + G_θ θ'      x' = X θ' + X_p R φ'      p[k+1]' = P θ' + (P_p R + V) φ'
     /// ```
     ///
     /// False where they are not sound.
@@ -155,17 +195,16 @@ impl Tied {
         pushes.respond(increment, increments, terms);
         pushes.respond_in_momentum(momentum, terms);
         let in_momentum = pushes.of_momentum();
-        for (t, (row, pushes)) in self.ties.rows().zip(self.pushes.chunks_exact(nd)).enumerate() {
+        for (t, row) in self.momenta.chunks_exact(nd).enumerate() {
             let column = in_momentum.iter_mut().skip(t).step_by(width);
-            for (to, (entry, push)) in column.zip(row.iter().zip(pushes)) {
-                *to += 2.0 * entry.length - push;
-            }
+            column.zip(row).for_each(|(to, momentum)| *to += momentum);
         }
-        let rows = self.ties.rows().zip(self.changes.chunks_exact(nd));
-        for (t, (row, changes)) in rows.enumerate() {
-            let force = &mut forces[t * stride..][..stride];
-            force.fill(0.0);
+        forces.fill(0.0);
+        for (row, force) in self.ties.rows().zip(forces.chunks_exact_mut(stride)) {
             by_parameters(row, nd, (turnings, time_step_s), force);
+        }
+        for (t, changes) in self.changes.chunks_exact(nd).enumerate() {
+            let force = &mut forces[t * stride..][..stride];
             terms.clear();
             terms.extend(non_zero(changes.iter().copied()));
             add_rows(force, increment, stride, terms);
@@ -187,7 +226,7 @@ impl Tied {
 
     /// Room for products.
     pub(crate) fn new_closing(model: &Model) -> Closing {
-        let (d, count) = (model.dimensions, model.tied_rows());
+        let (d, count) = (model.dimensions, model.tied_rows);
         let lu = PivotedLu::new(&vec![1.0; count], 1).with_independent(count);
         Closing::new(d.dynamic, 2 * d.coordinates(), lu, count)
     }
@@ -202,15 +241,15 @@ impl Tied {
     ) -> bool {
         let is_sound = self.factor(closing.take_responses(respond));
         closing.take_factors_of(&self.lu);
-        let rows = self.ties.rows().zip(self.pushes.chunks_exact(self.nd));
-        let rows = rows.zip(self.changes.chunks_exact(self.nd)).zip(closing.equations());
-        for (((row, pushes), changes), equation) in rows {
+        let mut ties = self.ties.rows();
+        let rows = self.momenta.chunks_exact(self.nd).zip(self.changes.chunks_exact(self.nd));
+        for ((momenta, changes), equation) in rows.zip(closing.equations()) {
             equation.by_increment.copy_from_slice(changes);
             equation.by_parameters.fill(0.0);
-            by_parameters(row, self.nd, step, equation.by_parameters);
-            for ((momentum, entry), push) in equation.momentum.iter_mut().zip(row).zip(pushes) {
-                *momentum += push - 2.0 * entry.length;
+            if let Some(row) = ties.next() {
+                by_parameters(row, self.nd, step, equation.by_parameters);
             }
+            equation.momentum.iter_mut().zip(momenta).for_each(|(to, momentum)| *to -= momentum);
         }
         is_sound
     }

@@ -22,7 +22,6 @@
 use plantd_math::scalar::Scalar;
 use plantd_math::spatial::Mat3;
 
-use crate::lagrangian::armature;
 use crate::lagrangian::curvature::Curvature;
 use crate::lagrangian::instant::Instant;
 use crate::lagrangian::kinematics::Poses;
@@ -145,14 +144,14 @@ impl<S: Scalar> Derivatives<S> {
         );
         if model.potentials.any {
             model.add_spring_gradient(&self.poses, q, &mut self.l_q);
-            armature::add_momentum(&model.armature, velocity, &mut self.l_v);
+            model.armature.add_momentum(velocity, &mut self.l_v);
         }
         self.evaluate_forces(model, q, velocity, inputs);
         self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta);
         let n = model.dimensions.coordinates();
         self.l_qq.fill(S::ZERO);
         // Where no pair of joints has an entry.
-        model.armature.iter().for_each(|a| self.l_vv[a.row * n + a.column] = S::ZERO);
+        model.armature.entries().for_each(|a| self.l_vv[a.row * n + a.column] = S::ZERO);
         for &[above, below, i, j] in &self.pairs {
             let second = self.curvature.pair(above, below);
             for (row, column, entry) in second.entries(i, j) {
@@ -172,7 +171,7 @@ impl<S: Scalar> Derivatives<S> {
             let l_qq = &mut self.l_qq;
             model
                 .for_each_spring_derivative(&self.poses, q, |i, j, value| l_qq[i * n + j] -= value);
-            for a in &model.armature {
+            for a in model.armature.entries() {
                 self.l_vv[a.row * n + a.column] += S::constant(a.inertia);
             }
         }

@@ -1,6 +1,5 @@
 //! Kinetic and potential energy.
 
-use crate::lagrangian::armature;
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
 use crate::model::mechanism::Model;
@@ -13,7 +12,7 @@ pub(crate) fn energy(
     velocity: &[f64],
 ) -> Energy {
     let twice_kinetic = momenta.twice_kinetic_energy(&model.dynamics, velocity)
-        + armature::twice_kinetic_energy(&model.armature, velocity);
+        + model.armature.twice_kinetic_energy(velocity);
     Energy {
         kinetic_j: 0.5 * twice_kinetic,
         potential_j: potential_energy(model, poses, momenta, q),

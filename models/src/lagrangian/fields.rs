@@ -177,7 +177,7 @@ impl Model {
         }
     }
 
-    /// Finds [`Model::acting`], and whether there are ties.
+    /// Finds [`Model::acting`], whether there are ties, and their rows with those of armatures.
     pub(crate) fn find_elements(&mut self) {
         let are_generated = self.forces.as_ref().is_none_or(Forces::are_generated)
             && self.potentials.springs.iter().all(Spring::is_generated);
@@ -186,6 +186,7 @@ impl Model {
             self.has_ties = true;
             self.acting = self.find_acting();
         }
+        self.tied_rows = self.rows_of_ties() + self.armature.sums.len();
     }
 
     /// [`Model::acting`].

@@ -224,7 +224,7 @@ mod tests {
         let random = random_models(40).into_iter().map(|mut model| {
             // Of bodies alone.
             model.potentials.springs.clear();
-            model.armature.clear();
+            model.armature = Default::default();
             model.planar = None;
             model
         });

@@ -107,7 +107,7 @@ impl Model {
     }
 
     /// How many rows they have.
-    pub(crate) fn tied_rows(&self) -> usize {
+    pub(crate) fn rows_of_ties(&self) -> usize {
         self.ties(1.0).map(|(tie, _)| tie.rows()).sum()
     }
 
@@ -140,7 +140,7 @@ impl Forces {
 impl Ties {
     pub(crate) fn new(model: &Model) -> Self {
         let n = model.dimensions.coordinates();
-        let count = model.tied_rows();
+        let count = model.rows_of_ties();
         Self {
             n,
             rows: vec![Entry::default(); n * count],

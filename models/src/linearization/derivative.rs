@@ -119,14 +119,14 @@ struct Formed {
 /// 0.7 of the time, with three for 128 in 0.13.
 pub(crate) fn is_generated(model: &Model, settings: &Settings) -> bool {
     let d = model.dimensions;
-    let is_open = 2 * (d.constraints + model.tied_rows()) <= d.dynamic;
+    let is_open = 2 * (d.constraints + model.tied_rows) <= d.dynamic;
     is_open && model.is_generated() && takes_split(model, settings)
 }
 
 impl ClosedTree {
     /// Room for those of a model.
     fn new(model: &Model) -> Self {
-        let ties = model.has_ties.then(|| Tied::new_closing(model));
+        let ties = (model.tied_rows > 0).then(|| Tied::new_closing(model));
         let has_constraints = model.dimensions.constraints > 0;
         let constraints = has_constraints.then(|| SchurComplement::new_closing(model));
         Self {
@@ -367,7 +367,7 @@ impl Workspace {
         let StepDerivative { ends, generated, by, x, momentum, .. } = out;
         let KktSystem { fields, tied, .. } = &self.kkt;
         let has_fields = fields.is_some() || !model.has_fields();
-        let has_ties = tied.is_some() || !model.has_ties;
+        let has_ties = tied.is_some() || model.tied_rows == 0;
         let has_constraints = model.dimensions.constraints > 0;
         let generated = &mut **generated.get_or_insert_with(|| {
             Box::new(Generated {

@@ -129,7 +129,7 @@ impl Workspace {
         let (increment, momentum, stride) = (&mut out.increment, &mut out.momentum, out.stride);
         in_space.write(Rows { increment, momentum, stride });
         self.kkt.in_space = Some(in_space);
-        if at.model.has_ties {
+        if self.kkt.tied.is_some() {
             // A pivot that is too small may be one by the generators alone.
             if result.is_err() || !self.tie(at, out) {
                 return Ok(false);

@@ -304,7 +304,7 @@ impl Workspace {
                 }
             });
         }
-        for a in model.armature.iter().filter(|a| balls.of(a.row).is_none()) {
+        for a in model.armature.entries().filter(|a| balls.of(a.row).is_none()) {
             sink.add(a.row, a.column, Entry { momentum: [0.0, a.inertia], ..Entry::default() });
         }
         for (i, c) in model.damping.iter().enumerate().filter(|(i, _)| balls.of(*i).is_none()) {
@@ -350,9 +350,9 @@ impl Workspace {
                 }
             }
         });
-        for a in &model.armature {
-            if let Some((o, axis)) = balls.of(a.row) {
-                tangents.balls[o].add(&ends.turnings[o], axis, [0.0, a.inertia], [h, skew]);
+        for &(i, inertia) in &model.armature.own {
+            if let Some((o, axis)) = balls.of(i) {
+                tangents.balls[o].add(&ends.turnings[o], axis, [0.0, inertia], [h, skew]);
             }
         }
     }

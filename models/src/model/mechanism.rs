@@ -46,8 +46,7 @@ pub struct Model {
     pub(crate) forces: Option<Forces>,
     pub(crate) signals: Vec<Signal>,
     pub(crate) potentials: Potentials,
-    /// What armatures add to the mass matrix.
-    pub(crate) armature: Vec<Armature>,
+    pub(crate) armature: Armatures,
     /// Joints that points of constraints depend on: what a step walks at its ends.
     pub(crate) closure: Tree,
     pub(crate) constraints: Vec<Constraint>,
@@ -62,6 +61,8 @@ pub struct Model {
     /// Whether what acts between bodies, but for that from the world, is taken as
     /// [ties](crate::lagrangian::ties): where generators alone do not have all of it.
     pub(crate) has_ties: bool,
+    /// How many rows ties and armatures of sums have beside generators.
+    pub(crate) tied_rows: usize,
     /// How many entries [`Model::input_pattern`] has.
     pub(crate) impulses: usize,
     /// Whether the end of steps is foreseen with the springs and forces that it has beside
@@ -169,7 +170,7 @@ impl Solver {
         if model.is_generated_in_space() {
             let with_rates = if model.blocks() == Blocks::Three { model.acted_on() } else { 0 };
             let is_deep =
-                Self::is_deep(&model.elimination, with_rates, d.constraints + model.tied_rows());
+                Self::is_deep(&model.elimination, with_rates, d.constraints + model.tied_rows);
             return if is_deep { Self::Spatial } else { Self::Tree };
         }
         let is_free = d.constraints == 0 && d.prescribed == 0 && model.joints_are_in_order();
@@ -280,13 +281,19 @@ impl Potentials {
     }
 }
 
-/// What armatures add to the mass matrix in the row and the column of two dynamic coordinates, or of one; the
-/// entry mirrored is another one.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Armature {
-    pub(crate) row: usize,
-    pub(crate) column: usize,
-    /// kg or kg·m².
+/// The armatures of a model.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Armatures {
+    /// Of single dynamic coordinates, none of them twice: the coordinate, and kg or kg·m².
+    pub(crate) own: Vec<(usize, f64)>,
+    pub(crate) sums: Vec<SumArmature>,
+}
+
+/// That of a sum of several dynamic coordinates, none of them of a ball joint.
+#[derive(Clone, Debug)]
+pub(crate) struct SumArmature {
+    pub(crate) terms: Vec<(usize, f64)>,
+    /// `a`, kg or kg·m² as the coefficients make it.
     pub(crate) inertia: f64,
 }
 
@@ -771,11 +778,10 @@ impl Model {
         self.planar.is_none() && self.is_generated()
     }
 
-    /// Whether vectors of the joints generate the whole Newton matrix, but for what [ties](Self::has_ties) give.
+    /// Whether vectors of the joints generate the whole Newton matrix, but for [rows](Self::tied_rows) of ties.
     pub(crate) fn is_generated(&self) -> bool {
         !self.forces.as_ref().is_some_and(|forces| forces.act_on_balls(&self.orientations))
             && self.acting.is_some()
-            && self.armature.iter().all(|armature| armature.row == armature.column)
             && self.joints_are_in_order()
     }
 

@@ -13,7 +13,6 @@ use crate::integrator::settings::{ForceSplit, HALVINGS_MAX, SUBSTEPS_MAX, Settin
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::Workspace;
 use crate::kkt::system::{Factored, KktSystem};
-use crate::lagrangian::armature;
 use crate::lagrangian::energy::{Energy, energy};
 use crate::model::manifold::orientations;
 use crate::model::mechanism::{Model, Violation};
@@ -360,7 +359,7 @@ impl Workspace {
             &mut self.mid.l_q,
             &mut self.mid.l_v,
         );
-        armature::add_momentum(&model.armature, &self.mid.velocity, &mut self.mid.l_v);
+        model.armature.add_momentum(&self.mid.velocity, &mut self.mid.l_v);
     }
 
     /// Finds the velocity of the dynamic coordinates that belongs to a state, into `residual`; returns
@@ -379,9 +378,8 @@ impl Workspace {
         self.kkt.factored.tree.make_room(&model.elimination);
         self.kkt.factored.tree.clear();
         self.mid.mechanics.curvature.fill_mass_matrix(&model.pairs, &mut self.kkt.factored.tree);
-        for entry in &model.armature {
-            armature::add_to(&mut self.kkt.factored.tree, model, entry, 1.0);
-        }
+        let matrix = &mut self.kkt.factored.tree;
+        model.armature.entries().for_each(|entry| entry.add_to(matrix, model, 1.0));
         let pivot =
             self.kkt.factored.tree.factor(&model.elimination, &model.conditioning.inertia, 1.0);
         for (i, r) in self.residual.dynamics.iter_mut().enumerate() {

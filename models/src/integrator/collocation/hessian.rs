@@ -84,7 +84,7 @@ impl Hessian {
                 (S::load(entry) - k).store(entry);
             }
         });
-        for a in &model.armature {
+        for a in model.armature.entries() {
             let entry = &mut vv[(a.row * n + a.column) * width + stage..];
             (S::load(entry) + a.inertia).store(entry);
         }

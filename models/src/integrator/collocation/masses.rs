@@ -60,7 +60,7 @@ impl<const N: usize> Masses<N> {
     /// Adds armatures, and factors.
     pub(crate) fn factor(&mut self, model: &Model) {
         let elimination = &model.elimination;
-        for armature in model.armature.iter().filter(|a| a.row >= a.column) {
+        for armature in model.armature.entries().filter(|a| a.row >= a.column) {
             if let Some(slot) = elimination.slot(armature.row, armature.column) {
                 for entry in &mut self.entries[slot * self.groups..][..self.groups] {
                     *entry = *entry + armature.inertia;

@@ -24,7 +24,6 @@ use crate::integrator::scheme::Tableau;
 use crate::integrator::settings::Precision;
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::{StepContext, Workspace};
-use crate::lagrangian::armature;
 use crate::lagrangian::forces;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::model::mechanism::{Model, Spring, ball_of};
@@ -324,7 +323,7 @@ impl<const N: usize> System<N> {
         self.take_turns(g);
         let (poses, velocity) = (&self.mechanics[g].poses, &self.velocity[g * n..][..n]);
         model.add_spring_gradient(poses, &self.positions, &mut self.l_q[g * nd..][..nd]);
-        armature::add_momentum(&model.armature, velocity, &mut self.l_v[g * nd..][..nd]);
+        model.armature.add_momentum(velocity, &mut self.l_v[g * nd..][..nd]);
     }
 
     /// Configurations of `N` stages with their whole turns.

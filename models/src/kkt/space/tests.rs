@@ -110,7 +110,7 @@ fn generate(workspace: &mut Workspace, model: &Model) {
     let stride = spread(padded(2 * model.dimensions.coordinates()));
     workspace.tangents.make_room_beside_generators(model, stride);
     workspace.kkt.fields = model.has_fields().then(|| Box::new(Fields::new(model)));
-    workspace.kkt.tied = model.has_ties.then(|| Box::new(Tied::new(model, stride)));
+    workspace.kkt.tied = (model.tied_rows > 0).then(|| Box::new(Tied::new(model, stride)));
 }
 
 /// The matrix that is filled entry by entry.
@@ -439,21 +439,27 @@ fn joints_that_are_moved_pass_on_what_is_below_them() {
         moved(&["f2_rx", "f2_ry", "f2_rz", "f8_rx", "f8_ry", "f8_rz"], floating()),
         moved(&["f0", "f40"], compiled(&rope(64, ""))),
     ] {
-        let (d, model) = (model.dimensions, Arc::new(model));
-        assert!(d.prescribed > 0);
+        let model = Arc::new(model);
+        assert!(model.dimensions.prescribed > 0);
         let mut fast = move_alike(&model, 50);
-        let workspace = &mut fast.workspace;
-        assert!(workspace.find_velocity_by_recursion(&model, &fast.settings, &fast.state));
-        let recursive = workspace.residual.dynamics.clone();
-        workspace.find_velocity(&model, &fast.state);
-        let direct = workspace.residual.dynamics.clone();
-        // Both belong to the momentum of the state: in a long rope velocities follow from it with fewer digits.
-        for velocity in [recursive, direct] {
-            let velocity = [&velocity[..d.dynamic], &fast.state.v].concat();
-            workspace.gradient_at(&model, &fast.state, &velocity);
-            let found = apart(&workspace.mid.l_v, &fast.state.p);
-            assert!(found < 1e-13, "{found:e}");
-        }
+        assert_velocity(&mut fast);
+    }
+}
+
+/// The velocity that belongs to the momentum, by generators and entry by entry.
+fn assert_velocity(plant: &mut Plant) {
+    let Plant { model, settings, state, workspace, .. } = plant;
+    let nd = model.dimensions.dynamic;
+    assert!(workspace.find_velocity_by_recursion(model, settings, state));
+    let recursive = workspace.residual.dynamics.clone();
+    workspace.find_velocity(model, state);
+    let direct = workspace.residual.dynamics.clone();
+    // Both belong to the momentum of the state: in a long rope velocities follow from it with fewer digits.
+    for velocity in [recursive, direct] {
+        let velocity = [&velocity[..nd], &state.v].concat();
+        workspace.gradient_at(model, state, &velocity);
+        let found = apart(&workspace.mid.l_v, &state.p);
+        assert!(found < 1e-13, "{found:e}");
     }
 }
 
@@ -701,10 +707,63 @@ fn what_acts_between_branches_is_tied() {
         (50, closed(floating(), Joined::AtPoint, ["f8", "f7", "f6", "world"], &of_limbs, &ball)),
     ] {
         let model = Arc::new(model);
-        assert!(model.has_ties && model.tied_rows() > 0);
+        assert!(model.has_ties && model.tied_rows > 0);
         let mut fast = move_alike(&model, steps);
         if model.dimensions.constraints == 0 {
             assert_generates(&mut fast);
+        }
+    }
+}
+
+/// Armatures of sums of coordinates are rows beside the generators, in masses too: alone, next to what acts across
+/// joints, with other ties, with joints that are moved, ball joints, and constraints.
+#[test]
+fn armatures_of_sums_are_tied() {
+    let tree = "gravity = [1.0, -2.0, -9.0]\ntime_step_s = 0.002";
+    let rotors = |names: [&str; 4], scale: f64| {
+        let [a, b, c, d] = names;
+        let sum = |terms: [(&str, f64); 2], armature: f64| {
+            let armature = scale * armature;
+            let terms = terms
+                .map(|(name, c)| format!("{{ coordinate = \"{name}\", coefficient = {c:?} }}"));
+            format!("[[armatures]]\narmature = {armature:?}\nterms = [{}]\n", terms.join(", "))
+        };
+        sum([(a, 1.0), (b, -0.7)], 0.3)
+            + &sum([(c, 2.0), (b, 0.4)], 0.05)
+            + &sum([(d, 1.0), (a, 1.0)], 0.2)
+    };
+    let four = ["f3", "f9", "f12", "f20"];
+    let branches = || branching(24, tree, "damping = 0.3");
+    let limbs = ["f1", "f3", "f5", "f7"];
+    let across = between(&[["f3", "f9"], ["f9", "f12"]]);
+    // By small inertias of its joints.
+    let on_rope = |more: &str| compiled(&rope(24, &(rotors(four, 0.01) + more)));
+    for (steps, has_ties, model) in [
+        (50, false, compiled(&(branches().scene().to_toml() + &rotors(four, 1.0)))),
+        (50, false, pulled(&branches(), ["f23", "f10"], &rotors(four, 1.0), &["f2", "f10"])),
+        (50, true, pulled(&branches(), ["f1", "f0"], &(rotors(four, 1.0) + &sums(four)), &["f1"])),
+        (50, false, pulled(&floating(), ["hull", "f2"], &rotors(limbs, 1.0), &[])),
+        (5, false, on_rope("")),
+        (5, false, on_rope(&across)),
+        (
+            50,
+            false,
+            closed(
+                branches(),
+                Joined::AtPoint,
+                ["f21", "world", "f17", "f12"],
+                &rotors(four, 1.0),
+                &["f2"],
+            ),
+        ),
+    ] {
+        let model = Arc::new(model);
+        assert!(model.has_ties == has_ties && model.tied_rows >= model.armature.sums.len());
+        assert_eq!(model.armature.sums.len(), 3);
+        let mut fast = move_alike(&model, steps);
+        if model.dimensions.constraints == 0 {
+            assert_generates(&mut fast);
+            assert_velocity(&mut fast);
         }
     }
 }
