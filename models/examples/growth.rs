@@ -2,9 +2,10 @@
 //! has what sends other programs to dense matrices: a top that is moved, a ball joint, and a spring from its tip to the
 //! world.
 //!
-//! `cargo run --release -p plantd-models --example growth`; in place of the spring to the world, with `-- braced` springs
-//! all along, each over two of the joints, with `-- tied` an elastic tendon over five rods, with `-- pinned` a tip that is
-//! held where it is, with `-- dragged` one that goes with a hook as it is moved, and with `-- welded` one whose rod is held
+//! `cargo run --release -p plantd-models --example growth`; in place of the spring to the world, with `-- braced`
+//! springs all along, each over two of the joints, with `-- tied` an elastic tendon over five rods, with `-- geared` a
+//! rotor behind three joints, with `-- pinned` a tip that is held where it is, with `-- dragged` one that goes with a
+//! hook as it is moved, and with `-- welded` one whose rod is held.
 
 use std::error::Error;
 use std::f64::consts::TAU;
@@ -66,6 +67,12 @@ fn rope(joints: usize, kind: &str) -> Result<Scene, Box<dyn Error>> {
                 "[[springs]]\ntype = \"path\"\npoints = [{}]\nstiffness = 2.0\nrest_length = 0.9\n",
                 points.join(", ")
             );
+        }
+        "geared" => {
+            let rods = [1, rods / 2, rods - 2];
+            let terms =
+                rods.map(|rod| format!("{{ coordinate = \"rod{rod}\", coefficient = 1.0 }}"));
+            text += &format!("[[armatures]]\narmature = 0.001\nterms = [{}]\n", terms.join(", "));
         }
         "pinned" | "dragged" | "welded" => {
             text +=

@@ -21,12 +21,12 @@ use crate::model::mechanism::Model;
 /// The derivative of a control period as a map, `x[k+1]' = A x[k]' + B u[k]'`, and its transpose: for gradients along
 /// motions, and for whoever solves by iteration.
 ///
-/// Of one step of the midpoint rule of a tree it takes O(n) to find and to apply, and O(n) of memory, where `A` and
-/// `B` take O(n²). Each of `m` equations of constraints, and of rows of what acts between two bodies of which none is
-/// above the other, along paths over several bodies and on sums of coordinates, takes another O(n) to apply and
-/// O(n m) to find, up to one for two dynamic coordinates. Springs, drag and forces at points and frames are taken with
-/// equal halves ([`ForceSplit::Symmetric`](crate::ForceSplit)) alone. All else, lengths that are prescribed and
-/// armatures of sums among it, is by the matrices, to the same numbers. The memory is made by the first
+/// Of one step of the midpoint rule of a tree it takes O(n) to find and to apply, and O(n) of memory, where `A` and `B`
+/// take O(n²). Each of `m` equations of constraints, and of rows of what acts between two bodies of which none is above
+/// the other, along paths over several bodies and on sums of coordinates, and of armatures of such sums, takes another
+/// O(n) to apply and O(n m) to find, up to one for two dynamic coordinates. Springs, drag and forces at points and
+/// frames are taken with equal halves ([`ForceSplit::Symmetric`](crate::ForceSplit)) alone. All else, forces on single
+/// coordinates of ball joints among it, is by the matrices, to the same numbers. The memory is made by the first
 /// [`Plant::differentiate`](crate::Plant::differentiate).
 ///
 /// ```

@@ -201,7 +201,32 @@ const CASES: &[(&str, u64, &[&str])] = &[
     ("marionette", 50, PLANT),
     ("walker-4", 20, PLANT),
     ("balls-7", 20, PLANT),
+    ("sprung-rope", 20, PLANT),
+    ("damped-rope", 20, PLANT),
     ("marionette", 10, &["riccati"]),
+];
+/// What is on ropes of 32 hinges in space: vectors of their joints have two blocks, and three.
+const ON_ROPES: &[(&str, &str)] = &[
+    (
+        "sprung-rope",
+        r#"
+[[springs]]
+type = "two_point"
+a = { frame = "rod31" }
+b = { frame = "world", at = [0.3, 0.2, -3.0] }
+stiffness = 2.0
+"#,
+    ),
+    (
+        "damped-rope",
+        r#"
+[[forces]]
+type = "two_point_damper"
+a = { frame = "rod5", at = [0.02, 0.0, 0.0] }
+b = { frame = "rod28", at = [0.0, 0.02, 0.0] }
+damping = 0.5
+"#,
+    ),
 ];
 const PLANT: &[&str] = &["step", "linearize", "step-and-linearize", "contract"];
 const ALL: &[&str] = &["step", "linearize", "step-and-linearize", "contract", "riccati", "lqr"];
@@ -240,6 +265,26 @@ fn instructions_per_step_are_those_of_the_table() {
     );
 }
 
+/// A rope of this name; none of others.
+fn rope(name: &str) -> Option<String> {
+    let (_, more) = ON_ROPES.iter().find(|(rope, _)| *rope == name)?;
+    let mut text = format!("format = 1\nname = \"{name}\"\ngravity = [0.0, 0.0, -9.81]\n");
+    for i in 0..32 {
+        let (parent, z) = match i {
+            0 => ("world".to_owned(), 0.0),
+            _ => (format!("rod{}", i - 1), -0.1),
+        };
+        let axis = ["[1.0, 0.0, 0.0]", "[0.0, 1.0, 0.0]"][i % 2];
+        text += &format!(
+            "[[frames]]\nname = \"rod{i}\"\nparent = \"{parent}\"\ntranslation = [0.0, 0.0, {z:?}]\n\
+             joint = {{ type = \"revolute\", axis = {axis} }}\n\
+             body = {{ mass = 0.1, center_of_mass = [0.0, 0.0, -0.05], inertia = [1e-4, 1e-4, 1e-5] }}\n\
+             [[coordinates]]\nname = \"rod{i}\"\ninitial = 0.02\n"
+        );
+    }
+    Some(text + more)
+}
+
 /// What `plantctl explain` says a step costs, against what it did cost when the table was made.
 #[test]
 fn estimates_of_cost_are_right_to_a_factor_of_two() {
@@ -247,7 +292,10 @@ fn estimates_of_cost_are_right_to_a_factor_of_two() {
     let text = std::fs::read_to_string(path).expect("the table is there");
     let table: Table = toml::from_str(&text).expect("the table is TOML");
     for (name, counts) in &table.scenes {
-        let scene = plantd_models::builtin::scene(name).expect("a built-in scene");
+        let scene = match rope(name) {
+            Some(text) => plantd_models::Scene::from_toml(&text).expect("a scene"),
+            None => plantd_models::builtin::scene(name).expect("a built-in scene"),
+        };
         let costs = plantd_models::Model::compile(&scene).expect("it compiles").stage_costs();
         let step: f64 = costs.iter().map(|stage| stage.times * stage.instructions).sum();
         let linearization: f64 =
@@ -307,12 +355,18 @@ impl Valgrind {
     fn profile(&self, scene: &str, operation: &str, calls: u64) -> Profile {
         let directory = tempfile::tempdir().expect("a temporary folder");
         let file = directory.path().join("callgrind.out");
+        let mut path = PathBuf::from(scene);
+        if let Some(text) = rope(scene) {
+            path = directory.path().join("rope.toml");
+            std::fs::write(&path, text).expect("the scene is written");
+        }
         let output = Command::new("valgrind")
             .args(["--tool=callgrind", "--toggle-collect=measured_call"])
             .args(["--compress-strings=no", "--compress-pos=no"])
             .arg(format!("--callgrind-out-file={}", file.display()))
             .arg(&self.program)
-            .args([scene, operation, &calls.to_string()])
+            .arg(path)
+            .args([operation, &calls.to_string()])
             .output()
             .expect("valgrind starts");
         let messages = String::from_utf8_lossy(&output.stderr);
