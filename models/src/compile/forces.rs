@@ -15,6 +15,14 @@ use crate::model::signal::{Signal, Target};
 use crate::model::tree::{Attachment, Tree, WORLD};
 
 impl Layout {
+    /// A force on a coordinate.
+    fn force_on(&self, coordinate: usize, law: CoordinateLaw) -> CoordinateForce {
+        let component = |first: &usize| coordinate.checked_sub(*first).filter(|i| *i < 3);
+        let mut balls = self.orientations.iter().map(component).enumerate();
+        let ball = balls.find_map(|(orientation, component)| Some((orientation, component?)));
+        CoordinateForce { coordinate, ball, law }
+    }
+
     pub(super) fn coordinate_inputs(&self, scene: &Scene) -> Vec<CoordinateInput> {
         let mut inputs: Vec<CoordinateInput> = Vec::new();
         for (input, i) in scene.inputs.iter().enumerate() {
@@ -137,8 +145,7 @@ impl Places<'_> {
             }
             scene::Force::CoordinateDrag { coordinate, coefficient, cubic } => {
                 let law = CoordinateLaw::Drag([*coefficient, *cubic]);
-                let coordinate = index[coordinate];
-                forces.coordinate_forces.push(CoordinateForce { coordinate, law });
+                forces.coordinate_forces.push(layout.force_on(index[coordinate], law));
             }
             scene::Force::LinearDamper { terms, damping, input } => {
                 let terms = layout.linear(terms);
@@ -160,9 +167,8 @@ impl Places<'_> {
                 }
                 if *constant != 0.0 {
                     let terms = layout.servo_terms(force).into_iter();
-                    forces.coordinate_forces.extend(terms.map(|(coordinate, c)| CoordinateForce {
-                        coordinate,
-                        law: CoordinateLaw::Constant(c * constant),
+                    forces.coordinate_forces.extend(terms.map(|(coordinate, c)| {
+                        layout.force_on(coordinate, CoordinateLaw::Constant(c * constant))
                     }));
                 }
             }
@@ -170,8 +176,7 @@ impl Places<'_> {
                 let (force, velocity) = (*force, *velocity);
                 if let Some(name) = coordinate {
                     let law = CoordinateLaw::Friction { force, velocity };
-                    let coordinate = index[name];
-                    forces.coordinate_forces.push(CoordinateForce { coordinate, law });
+                    forces.coordinate_forces.push(layout.force_on(index[name], law));
                 } else if points.is_empty() {
                     let law = LinearLaw::Friction { force, velocity };
                     let terms = layout.linear(terms);
@@ -192,8 +197,9 @@ impl Places<'_> {
         let Some(stop) = self.layout.stop(spring).filter(|stop| stop.damping > 0.0) else { return };
         match coordinate {
             Some(name) => {
-                let (coordinate, law) = (self.layout.index[name], CoordinateLaw::Stop(stop));
-                forces.coordinate_forces.push(CoordinateForce { coordinate, law });
+                let force =
+                    self.layout.force_on(self.layout.index[name], CoordinateLaw::Stop(stop));
+                forces.coordinate_forces.push(force);
             }
             None => forces.path_forces.push(PathForce {
                 segments: self.segments(points),

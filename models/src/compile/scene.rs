@@ -106,8 +106,7 @@ fn assemble(scene: &Scene, layout: Layout) -> Model {
     let damping = layout.damping(scene);
     let gravity = Vec3(scene.gravity.unwrap_or_default());
     let gravity = (gravity != Vec3::ZERO).then_some(gravity);
-    let acts_at_poses = |forces: &Forces| forces.need_poses(&layout.orientations);
-    let needs_poses = forces.as_ref().is_some_and(acts_at_poses) || potentials.couple_branches;
+    let needs_poses = forces.as_ref().is_some_and(Forces::need_poses) || potentials.couple_branches;
     let dimensions = Dimensions {
         dynamic,
         prescribed: layout.coordinates.len() - dynamic,
@@ -160,7 +159,7 @@ fn assemble(scene: &Scene, layout: Layout) -> Model {
     model.find_elements();
     model.foresees_elements = dimensions.constraints == 0
         && model.is_generated_in_space()
-        && !model.has_simple_elements();
+        && (!model.has_simple_elements() || !model.orientations.is_empty());
     model.solver = Solver::of(&model);
     model.initial_violations = model.violations_at_start();
     model.conditioning = Conditioning::new(&model);

@@ -50,7 +50,7 @@ impl Midpoint {
             });
             take(orientation, &own);
         }
-        if let Some(forces) = model.forces.as_ref().filter(|forces| forces.cross_balls()) {
+        if let Some(forces) = model.forces.as_ref().filter(|forces| forces.act_on_balls()) {
             forces.for_each_derivative_across(&self.instant(model), |mover, i, j, by_q, by_v| {
                 if let Mover::Ball(orientation) = mover {
                     let (mut own, first) = (OwnTorque::NONE, model.orientations[orientation]);
@@ -58,6 +58,11 @@ impl Midpoint {
                     own.by_velocity.0[j - first].0[i - first] = weight * by_v;
                     take(orientation, &own);
                 }
+            });
+            forces.for_each_derivative_of_balls(&self.instant(model), |orientation, axis, by_v| {
+                let mut own = OwnTorque::NONE;
+                own.by_velocity.0[axis].0[axis] = weight * by_v;
+                take(orientation, &own);
             });
         }
         let Some(fields) = fields else { return };

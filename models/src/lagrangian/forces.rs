@@ -128,7 +128,7 @@ impl Forces {
         at: &Instant<'_, S>,
         mut entry: impl FnMut(usize, S, S),
     ) {
-        for force in &self.coordinate_forces {
+        for force in self.coordinate_forces.iter().filter(|force| force.ball.is_none()) {
             force.for_each_derivative(at, &mut |i, _, by_q, by_v| entry(i, by_q, by_v));
         }
         self.for_each_derivative_across(at, |mover, i, _, by_q, by_v| {
@@ -156,11 +156,19 @@ impl Forces {
         }
     }
 
-    /// Whether some act across one ball joint.
-    pub(crate) fn cross_balls(&self) -> bool {
-        let points = self.point_forces.iter().map(|force| force.ends.mover);
-        let paths = self.path_forces.iter().map(|force| mover(&force.segments));
-        points.chain(paths).any(|mover| matches!(mover, Some(Mover::Ball(_))))
+    /// Calls `entry(orientation, component, ∂f/∂v)` for the forces on components of the velocities of ball joints.
+    pub(crate) fn for_each_derivative_of_balls(
+        &self,
+        at: &Instant<'_>,
+        mut entry: impl FnMut(usize, usize, f64),
+    ) {
+        for force in &self.coordinate_forces {
+            if let Some((orientation, component)) = force.ball {
+                force.for_each_derivative(at, &mut |_, _, _, by_v| {
+                    entry(orientation, component, by_v);
+                });
+            }
+        }
     }
 
     /// The sum of [`GeneralizedForce::second_derivative`] over all forces.

@@ -25,8 +25,8 @@ use crate::model::mechanism::Model;
 /// take O(n²). Each of `m` equations of constraints, and of rows of what acts between two bodies of which none is above
 /// the other, along paths over several bodies and on sums of coordinates, and of armatures of such sums, takes another
 /// O(n) to apply and O(n m) to find, up to one for two dynamic coordinates. Springs, drag and forces at points and
-/// frames are taken with equal halves ([`ForceSplit::Symmetric`](crate::ForceSplit)) alone. All else, forces on single
-/// coordinates of ball joints among it, is by the matrices, to the same numbers. The memory is made by the first
+/// frames are taken with equal halves ([`ForceSplit::Symmetric`](crate::ForceSplit)) alone. All else, collocation and
+/// several substeps among it, is by the matrices, to the same numbers. The memory is made by the first
 /// [`Plant::differentiate`](crate::Plant::differentiate).
 ///
 /// ```

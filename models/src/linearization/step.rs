@@ -549,7 +549,7 @@ pub(crate) fn takes_split(model: &Model, settings: &Settings) -> bool {
             && model
                 .forces
                 .as_ref()
-                .is_none_or(|forces| !forces.cross_balls() && !model.has_fields())
+                .is_none_or(|forces| !forces.act_on_balls() && !model.has_fields())
 }
 
 /// Writes how an equation at the end changes with the columns `(q, p, k)`, at a fixed increment.

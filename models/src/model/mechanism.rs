@@ -66,7 +66,7 @@ pub struct Model {
     /// How many entries [`Model::input_pattern`] has.
     pub(crate) impulses: usize,
     /// Whether the end of steps is foreseen with the springs and forces that it has beside
-    /// [simple ones](Model::has_simple_elements).
+    /// [simple ones](Model::has_simple_elements), and with these, too, where it has ball joints.
     pub(crate) foresees_elements: bool,
     /// What pivots are compared with.
     pub(crate) conditioning: Conditioning,
@@ -323,14 +323,16 @@ impl Forces {
     }
 
     /// Whether they are more than forces on single coordinates, none of them of a ball joint.
-    pub(crate) fn need_poses(&self, orientations: &[usize]) -> bool {
-        self.coupling() > 0 || self.act_on_balls(orientations)
+    pub(crate) fn need_poses(&self) -> bool {
+        self.coupling() > 0 || self.act_on_balls()
     }
 
-    /// Whether some act on single coordinates of ball joints.
-    fn act_on_balls(&self, orientations: &[usize]) -> bool {
-        let mut coordinates = self.coordinate_forces.iter().map(|force| force.coordinate);
-        coordinates.any(|i| ball_of(orientations, i).is_some())
+    /// Whether some act across one ball joint, or on a component of its velocity.
+    pub(crate) fn act_on_balls(&self) -> bool {
+        let points = self.point_forces.iter().map(|force| force.ends.mover);
+        let paths = self.path_forces.iter().map(|force| mover(&force.segments));
+        self.coordinate_forces.iter().any(|force| force.ball.is_some())
+            || points.chain(paths).any(|mover| matches!(mover, Some(Mover::Ball(_))))
     }
 }
 
@@ -384,6 +386,8 @@ pub(crate) enum PointLaw {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct CoordinateForce {
     pub(crate) coordinate: usize,
+    /// The orientation that it is a component of, and which one.
+    pub(crate) ball: Option<(usize, usize)>,
     pub(crate) law: CoordinateLaw,
 }
 
@@ -780,9 +784,7 @@ impl Model {
 
     /// Whether vectors of the joints generate the whole Newton matrix, but for [rows](Self::tied_rows) of ties.
     pub(crate) fn is_generated(&self) -> bool {
-        !self.forces.as_ref().is_some_and(|forces| forces.act_on_balls(&self.orientations))
-            && self.acting.is_some()
-            && self.joints_are_in_order()
+        self.acting.is_some() && self.joints_are_in_order()
     }
 
     /// Whether springs, armatures or forces may have entries in the Newton matrix where bodies have none.

@@ -20,8 +20,7 @@ use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::samples::{prescribe, rubbing};
 use crate::linearization::derivative::StepDerivative;
 use crate::linearization::linearize::Linearization;
-use crate::model::mechanism::Acting;
-use crate::model::mechanism::{Model, Solver};
+use crate::model::mechanism::{Acting, Forces, Model, Solver};
 use crate::plant::facade::Plant;
 use crate::plant::initial::Initial;
 use crate::plant::site::Pose;
@@ -529,6 +528,31 @@ fn what_acts_from_the_world_is_generated() {
         assert!(model.has_fields());
         let mut fast = move_alike(&model, steps);
         assert_generates(&mut fast);
+    }
+}
+
+/// Friction and drag of components of the velocities of ball joints, by themselves and with all else.
+#[test]
+fn friction_of_ball_joints_is_their_own() {
+    let rubbed = "[[forces]]\ntype = \"friction\"\ncoordinate = \"f4_rx\"\nforce = 0.3\nvelocity = 0.5\n\
+                  [[forces]]\ntype = \"coordinate_drag\"\ncoordinate = \"f2_ry\"\ncoefficient = 0.4\ncubic = 0.1\n\
+                  [[forces]]\ntype = \"friction\"\ncoordinate = \"f5\"\nforce = 0.2\nvelocity = 0.5\n";
+    let text = floating().scene().to_toml() + rubbed;
+    let spring = "[[springs]]\ntype = \"coordinate\"\ncoordinate = \"f3\"\nstiffness = 9.0\n";
+    for model in [
+        compiled(&text),
+        compiled(&(text + spring)),
+        pulled(&floating(), ["f8", "f4"], rubbed, &[]),
+        pulled(&floating(), ["f7", "f6"], rubbed, &["f1", "f7"]),
+        closed(floating(), Joined::AtPoint, ["f8", "f7", "f6", "world"], rubbed, &[]),
+    ] {
+        let model = Arc::new(model);
+        assert!(model.forces.as_ref().is_some_and(Forces::act_on_balls));
+        let mut fast = move_alike(&model, 50);
+        if model.dimensions.constraints == 0 {
+            assert!(model.foresees_elements);
+            assert_generates(&mut fast);
+        }
     }
 }
 
